@@ -1,0 +1,89 @@
+"""Zarr over a store's folder: every chunk written is durable, every chunk read has passed its checksum."""
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import google_crc32c
+import numpy as np
+import zarr
+from zarr.abc.store import ByteRequest
+from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
+from zarr.storage import LocalStore
+
+from relight_formats.errors import StoreError
+from relight_formats.files import write_durably
+
+
+def is_chunk(key: str) -> bool:
+    """Whether a path inside a store names a chunk file (`c`, `c.0`, `c.3.0`)."""
+    name = key.rpartition("/")[2]
+    return name == "c" or name.startswith("c.")
+
+
+def chunk_problem(data: bytes) -> str | None:
+    """What is wrong with the bytes of a chunk file, or None: its last four bytes are the CRC-32C of the others."""
+    if len(data) < 4:
+        return f"is cut short to {len(data)} bytes"
+    computed = google_crc32c.value(np.frombuffer(data, dtype=np.uint8, count=len(data) - 4))
+    if computed != int.from_bytes(data[-4:], "little"):
+        return "does not match its checksum"
+    return None
+
+
+class WrittenFolder(LocalStore):
+    """For writing: a chunk's content is on disk when the assignment that wrote it returns (its name after the next
+    `Writer.record`), and a crash leaves no half chunk under a chunk's name."""
+
+    async def _set(self, key: str, value: Buffer, exclusive: bool = False) -> None:
+        self._check_writable()
+        await asyncio.to_thread(self.set_sync, key, value)
+
+    def set_sync(self, key: str, value: Buffer) -> None:
+        write_durably(self.root / key, value.as_buffer_like(), sync_folder=False)
+
+
+class CommittedFolder(LocalStore):
+    """For reading a finished store: a chunk that is missing or does not match its checksum raises StoreError."""
+
+    def __init__(self, root: Path | str, *, read_only: bool = True) -> None:
+        super().__init__(root, read_only=True)
+
+    async def get(
+        self, key: str, prototype: BufferPrototype | None = None, byte_range: ByteRequest | None = None
+    ) -> Buffer | None:
+        return await asyncio.to_thread(self.get_sync, key, prototype=prototype, byte_range=byte_range)
+
+    def get_sync(
+        self, key: str, *, prototype: BufferPrototype | None = None, byte_range: ByteRequest | None = None
+    ) -> Buffer | None:
+        if not is_chunk(key):
+            return super().get_sync(key, prototype=prototype, byte_range=byte_range)
+        assert byte_range is None, "chunks are read whole"
+        path = self.root / key
+        array = key.rpartition("/")[0]
+        try:
+            data = path.read_bytes()
+        except FileNotFoundError:
+            problem: str | None = "is missing"
+        else:
+            problem = chunk_problem(data)
+        if problem:
+            raise StoreError(
+                f"{self.root}: array {array}: chunk file {path} {problem}; the store is damaged. "
+                f"Make it again (--overwrite)."
+            )
+        return (prototype or default_buffer_prototype()).buffer.from_bytes(data)
+
+
+def open_written(folder: Path, name: str) -> zarr.Array[Any]:
+    """An array of a store being written, for reading and writing. Chunks of fill values are written too, so that a
+    missing chunk file always means a chunk that was never written."""
+    array: zarr.Array[Any] = zarr.open_array(WrittenFolder(folder), path=name, mode="r+", zarr_format=3)
+    return array.with_config({"write_empty_chunks": True})  # `open_array` ignores this setting
+
+
+def open_committed(folder: Path, name: str) -> zarr.Array[Any]:
+    """An array of a finished store, for reading."""
+    array: zarr.Array[Any] = zarr.open_array(CommittedFolder(folder), path=name, mode="r", zarr_format=3)
+    return array

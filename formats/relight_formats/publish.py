@@ -1,0 +1,73 @@
+"""From `NAME.partial` to `NAME`, and putting right what a crash left half-way.
+
+The steps of replacing a store: NAME -> NAME.replaced, NAME.partial -> NAME, delete NAME.replaced. At every point a
+complete store exists under one of the names, and `tidy` finishes the job.
+"""
+
+import contextlib
+import os
+from pathlib import Path
+from typing import Any
+
+from relight_formats.errors import StoreError
+from relight_formats.files import REPLACED, fsync_folder, remove_store, sibling
+from relight_formats.header import is_store, read_root
+from relight_formats.ledger import FILE_NAME
+
+
+def publish(path: Path, partial: Path) -> None:
+    """Give a sealed store its final name, replacing the one that may be there."""
+    with contextlib.suppress(FileNotFoundError):
+        os.unlink(partial / FILE_NAME)
+    replaced = sibling(path, REPLACED)
+    if path.exists():
+        if not is_store(path):
+            raise StoreError(f"{path}: expected a relight store or nothing, found something else; move it away.")
+        os.rename(path, replaced)
+    os.rename(partial, path)
+    fsync_folder(path.parent)
+    if replaced.exists():
+        _need_ours(replaced)
+        remove_store(replaced)
+
+
+def discard(path: Path, partial: Path) -> None:
+    """Delete unfinished work. One rename first: half of a deleted store is never taken up as unfinished work."""
+    replaced = sibling(path, REPLACED)
+    os.rename(partial, replaced)
+    remove_store(replaced)
+
+
+def tidy(path: Path, partial: Path) -> bool:
+    """Finish what a crash interrupted; whether a sealed store took its final name by that. Needs the writer's lock.
+
+    Raises:
+        StoreError: `NAME.replaced` is in the way and is no relight store.
+    """
+    replaced = sibling(path, REPLACED)
+    if replaced.exists():
+        _need_ours(replaced)
+        if path.exists() or sealed(partial) or not sealed(replaced):
+            remove_store(replaced)
+        else:
+            os.rename(replaced, path)
+    if not sealed(partial):
+        return False
+    publish(path, partial)
+    return True
+
+
+def sealed(folder: Path) -> bool:
+    """Whether a whole store with its commit mark is there."""
+    try:
+        header: dict[str, Any] = read_root(folder)[0]
+    except StoreError:
+        return False
+    return header["complete"] is True
+
+
+def _need_ours(folder: Path) -> None:
+    """Raises StoreError unless `NAME.replaced` is a store, or what is left of one."""
+    # Empty: a crash came between deleting the root metadata, the last file, and deleting the folder.
+    if not is_store(folder) and any(folder.iterdir()):
+        raise StoreError(f"{folder}: expected a relight store or nothing, found something else; move it away.")

@@ -1,0 +1,35 @@
+"""Files that are either not there or complete: a temporary file beside, fsync, one rename."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+from relightcli.errors import InputError
+
+
+def write_atomic(path: str | Path, data: bytes) -> None:
+    """Put `data` at `path` in one step, so that a reader or a crash never sees half a file.
+
+    A symbolic link keeps pointing at its target. A device or a pipe is written to directly.
+    Raises InputError if the folder is missing or `path` is a folder; OSError (disk full, no permission) as it comes.
+    """
+    target = Path(os.path.realpath(path))
+    if target.is_dir():
+        raise InputError(f"{path}: is a folder; expected the name of a file to write.")
+    if not target.parent.is_dir():
+        raise InputError(f"{path}: the folder {target.parent} does not exist; create it first.")
+    if target.exists() and not stat.S_ISREG(target.stat().st_mode):
+        target.write_bytes(data)
+        return
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    try:
+        with open(temporary, "wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, target)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise

@@ -1,0 +1,85 @@
+"""Embree behind three calls. Rays live in a normalised frame, so that the scale and place of a scene do not matter.
+
+The frame recentres the scene on its bounding box and scales it by a power of two into [-1, 1]: the float32 mantissas
+that Embree sees are then the same for a scene in millimetres and in kilometres. Embree holds the interpreter lock:
+parallelism is processes, each with a `Tracer` of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Distance of a ray's origin from its surface, in the normalised frame. Coordinates there are below 1, spaced by at
+# most 2^-24; Embree's robust intersection is exact to a few such spacings.
+SURFACE_OFFSET = 2.0**-19
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Nearest hits. `face` (N,) int32, -1 where the ray leaves the scene; `u`, `v` (N,) float32 barycentric weights of
+    the face's second and third corner; `distance` (N,) float32 in the normalised frame, in units of the direction."""
+
+    face: NDArray[np.int32]
+    u: NDArray[np.float32]
+    v: NDArray[np.float32]
+    distance: NDArray[np.float32]
+
+
+class Tracer:
+    """A committed Embree scene over one indexed mesh.
+
+    positions (V, 3) float64 world; faces (F, 3) int32. Zero-area faces are harmless. Non-finite vertices must have
+    been refused before (Embree drops their faces in silence).
+    """
+
+    def __init__(self, positions: NDArray[np.float64], faces: NDArray[np.int32]) -> None:
+        from embreex import rtcore_scene
+        from embreex.mesh_construction import TriangleMesh
+
+        used = positions[np.unique(faces)] if len(faces) else np.zeros((1, 3))
+        low, high = used.min(axis=0), used.max(axis=0)
+        self.center: NDArray[np.float64] = 0.5 * (low + high)
+        half = float(np.max(high - low)) * 0.5
+        self.scale: float = 2.0 ** -math.ceil(math.log2(half)) if half > 0 else 1.0
+        self._scene: Any = rtcore_scene.EmbreeScene(robust=True)
+        self._keep: Any = None
+        if len(faces):
+            self._keep = TriangleMesh(self._scene, self.to_local(positions), np.ascontiguousarray(faces, np.int32))
+        self.empty = len(faces) == 0
+
+    def to_local(self, points: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+        """World points (..., 3) in the normalised frame, float32."""
+        return np.ascontiguousarray((np.asarray(points, np.float64) - self.center) * self.scale, dtype=np.float32)
+
+    def offset(
+        self, points: NDArray[np.floating[Any]], normals: NDArray[np.floating[Any]]
+    ) -> NDArray[np.float32]:
+        """Origins (N, 3) float32, normalised frame: world points moved off their surface along `normals`."""
+        local = (np.asarray(points, np.float64) - self.center) * self.scale
+        return np.ascontiguousarray(local + SURFACE_OFFSET * np.asarray(normals, np.float64), dtype=np.float32)
+
+    def occluded(
+        self,
+        origins: NDArray[np.float32],
+        directions: NDArray[np.float32],
+        max_distance: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.bool_]:
+        """True (N,) where anything lies along the ray, up to `max_distance` (N,) in units of the direction."""
+        if self.empty or len(origins) == 0:
+            return np.zeros(len(origins), bool)
+        found: NDArray[np.int32] = self._scene.run(origins, directions, dists=max_distance, query="OCCLUDED")
+        return found == 0
+
+    def intersect(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> Hits:
+        """Nearest hit of every ray. origins, directions (N, 3) float32 in the normalised frame."""
+        n = len(origins)
+        if self.empty or n == 0:
+            zero = np.zeros(n, np.float32)
+            return Hits(np.full(n, -1, np.int32), zero, zero, np.full(n, np.inf, np.float32))
+        found = self._scene.run(origins, directions, query="INTERSECT", output=True)
+        return Hits(found["primID"], found["u"], found["v"], found["tfar"])

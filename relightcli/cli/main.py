@@ -1,0 +1,91 @@
+"""The command line's root: subcommands load when called, errors become exit codes."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from importlib import import_module
+from types import FrameType
+from typing import Any
+
+import click
+
+from relightcli import __version__
+from relightcli.cli.exits import INTERRUPTED, exit_code
+
+# Name, module, one line for --help. The modules are imported only when their command runs.
+COMMANDS = {
+    "precompute": "Simulate the light transport of a scene once: SCENE.toml to a transfer store.",
+    "relight": "Make pictures from a store: new sky, camera, materials, sequences.",
+    "diff": "Compare images, sequences or stores; exit 1 when they differ too much.",
+    "inspect": "Show what a store holds, what it cost, and whether it is sound.",
+}
+
+
+class LazyGroup(click.Group):
+    """A group that knows its commands' names and imports one of them at most."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        if name not in COMMANDS:
+            return None
+        command: click.Command = import_module(f"relightcli.cli.{name}").command
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl(list(COMMANDS.items()))
+
+
+@click.command(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="relightcli")
+def group() -> None:
+    """Simulate light transport once, then make each new picture in a fraction of a second with a known error."""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point. Exit codes are those of interface.md: 0, 1 (diff), 2, 3, 4, 5, 130."""
+    sys.exit(run(sys.argv[1:] if arguments is None else arguments))
+
+
+def run(arguments: list[str]) -> int:
+    """Runs one command line and returns its exit code; prints errors to stderr, tracebacks only with -v."""
+    signal.signal(signal.SIGTERM, _interrupt)
+    verbose = any(a == "--verbose" or (a.startswith("-v") and a.strip("v") == "-") for a in arguments)
+    try:
+        result: Any = group.main(arguments, prog_name="relightcli", standalone_mode=False)
+        sys.stdout.flush()
+        return result if isinstance(result, int) else 0
+    except click.exceptions.Exit as stop:
+        return int(stop.exit_code)
+    except click.exceptions.NoArgsIsHelpError as error:
+        error.show()
+        return 2
+    except (click.exceptions.Abort, KeyboardInterrupt):
+        click.echo("relightcli: interrupted; finished blocks are kept, run the same command again to continue", err=True)
+        return INTERRUPTED
+    except click.ClickException as error:
+        error.show()
+        return 2
+    except BrokenPipeError:
+        # The reader of stdout has gone (head, a closed pager): nothing more to say, and nothing to flush at exit.
+        sys.stdout = open("/dev/null", "w")  # noqa: SIM115
+        return 0
+    except BaseException as error:
+        if verbose:
+            import traceback
+
+            traceback.print_exc()
+        code, message = exit_code(error)
+        click.echo(f"relightcli: {message}", err=True)
+        return code
+
+
+def _interrupt(signum: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""Options that several commands share, and how their results are told."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+Command = Callable[..., Any]
+
+
+def available_cores() -> int:
+    """Cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def output(help: str) -> Callable[[Command], Command]:  # noqa: A002
+    return click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help=help)
+
+
+def workers(command: Command) -> Command:
+    return click.option(
+        "--workers", type=click.IntRange(1, 1024), default=None, help="Worker processes. Default: all cores."
+    )(command)
+
+
+def overwrite(command: Command) -> Command:
+    return click.option("--overwrite", is_flag=True, help="Replace a store made from other inputs or settings.")(command)
+
+
+def report(command: Command) -> Command:
+    """--json, -q, -v."""
+    command = click.option("-v", "--verbose", is_flag=True, help="Show tracebacks and details.")(command)
+    command = click.option("-q", "--quiet", is_flag=True, help="No progress, no summary.")(command)
+    return click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout, nothing else.")(command)
+
+
+def tell(result: dict[str, Any], text: str, as_json: bool, quiet: bool) -> None:
+    """The result as JSON on stdout, or a summary on stderr."""
+    if as_json:
+        click.echo(json.dumps(result, allow_nan=False))
+    elif not quiet:
+        click.echo(text, err=True)
+
+
+def bytes_text(count: float) -> str:
+    """1234567 as '1.2 MB'."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if count < 1000:
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count /= 1000
+    return f"{count:.1f} TB"

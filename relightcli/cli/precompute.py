@@ -1,0 +1,75 @@
+"""relightcli precompute."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from relightcli.cli import options
+
+
+@click.command(name="precompute")
+@click.argument("scene", type=click.Path(path_type=Path))
+@options.output("Transfer store to make, e.g. transfer.zarr.")
+@click.option("--effects", default="auto", show_default=True, help="auto, all, or names: direct,shadows.")
+@click.option(
+    "--light-resolution", default=64, show_default=True, help="Texels along a face of the sky cube: 16 to 256."
+)
+@click.option(
+    "--refine", default=4, show_default=True, help="Visibility is probed every N texels and refined; 1 traces them all."
+)
+@click.option("--receivers", default="vertices", show_default=True, help="vertices, or pixels:CAMERA.")
+@click.option(
+    "--basis",
+    default="visibility",
+    show_default=True,
+    help="visibility (exact), or for Lambert surfaces in addition haar, sh or dense transfer.",
+)
+@click.option("--coefficients", default=128, show_default=True, help="Haar coefficients kept per receiver.")
+@click.option("--sh-order", default=6, show_default=True, help="Bands of the spherical harmonics.")
+@click.option("--bounces", default=0, show_default=True, help="Interreflections to simulate (this version: 0).")
+@click.option("--seed", default=0, show_default=True, help="Seed of the random checks.")
+@click.option("--allow-outside", is_flag=True, help="Let the scene file use files outside its folder.")
+@click.option("--dry-run", is_flag=True, help="Print the plan and its predicted cost; do nothing.")
+@options.workers
+@options.overwrite
+@options.report
+def command(
+    scene: Path, output: Path, workers: int | None, verbose: bool, quiet: bool, as_json: bool, **settings: Any
+) -> None:
+    """Simulate what every receiver of SCENE sees of the sky, and store it."""
+    from relightcli.stages.precompute import Config, precompute
+
+    config = Config(
+        scene=scene,
+        output=output,
+        workers=workers or options.available_cores(),
+        quiet=quiet or as_json,
+        **settings,
+    )
+    result = precompute(config)
+    options.tell(result, _text(result), as_json, quiet)
+
+
+def _text(result: dict[str, Any]) -> str:
+    lines = [f"note: {note}" for note in result["notes"]]
+    if result.get("dry_run"):
+        lines += [
+            f"{'simulate' if row['simulate'] else 'skip':9}{row['effect']:12}{row['evidence']}" for row in result["plan"]
+        ]
+        cost = result["predicted"]
+        lines.append(
+            f"{result['receivers']} receivers; predicted {cost['rays'] / 1e6:.1f} million rays, "
+            f"{cost['seconds']:.1f} s, {options.bytes_text(cost['bytes'])}"
+        )
+    elif result["status"] == "up to date":
+        lines.append(f"{result['store']} is up to date")
+    else:
+        lines.append(
+            f"{result['store']}: {result['receivers']} receivers, {result['rays'] / 1e6:.1f} million rays, "
+            f"{options.bytes_text(result['bytes'])}, {result['seconds']:.1f} s, "
+            f"peak {options.bytes_text(result['peak_bytes'])} per process, {result['wrong_bits']:.1e} of bits wrong"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,5 @@
+"""Error metrics."""
+
+from relightcli.core.measure.errors import psnr, relative_rmse, rmse
+
+__all__ = ["psnr", "relative_rmse", "rmse"]

@@ -1,0 +1,108 @@
+"""Irradiance under any sky, straight from visibility bits.
+
+The cosine is linear in the direction, so the integral over the visible sky is n . sum_t V_t m_t with m_t the moment
+(integral of L w) of texel t. Visible texels come in runs; with prefix sums of the moments along the flat texel order
+each run costs two look-ups, whatever its length. No basis is involved: what is lost is the texel's size alone.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from relightcli.core.lights.environment import SkyCube
+
+
+def moment_prefix(sky: SkyCube) -> NDArray[np.float64]:
+    """Running sums of the moments, (T + 1, 9) float64: three colours times x, y, z; the first row is zero."""
+    flat = sky.moment.reshape(-1, 9)
+    out = np.zeros((len(flat) + 1, 9))
+    np.cumsum(flat, axis=0, out=out[1:])
+    return out
+
+
+def irradiance(
+    bits: NDArray[np.uint8],
+    normals: NDArray[np.float32],
+    prefix: NDArray[np.float64],
+    threads: int = 1,
+) -> NDArray[np.float32]:
+    """E = n . sum over visible texels of the moments, W m^-2 in the units of the map times sr, (N, 3) float32.
+
+    bits (N, 6, R, R/8) uint8 visibility; normals (N, 3) unit; prefix from `moment_prefix`. Sums run in float64, so
+    that a sun of 1e6 leaves the digits of a sky of 1e-3; texels on the horizon may add a little below zero, which is
+    cut off.
+    """
+    words = np.ascontiguousarray(bits).reshape(len(bits), -1).view(np.uint64)
+    out = np.empty((len(bits), 3), np.float32)
+    normals = np.ascontiguousarray(normals, np.float32)
+    if threads <= 1:
+        _sum_runs(words, normals, prefix, out)
+        return out
+    cuts = np.linspace(0, len(bits), 4 * threads + 1).astype(int)
+    with ThreadPoolExecutor(threads) as pool:
+        jobs = [
+            pool.submit(_sum_runs, words[a:b], normals[a:b], prefix, out[a:b])
+            for a, b in zip(cuts[:-1], cuts[1:], strict=True)
+            if b > a
+        ]
+        for job in jobs:
+            job.result()
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _sum_runs(words, normals, prefix, out):  # type: ignore[no-untyped-def]
+    one = np.uint64(1)
+    top = np.uint64(63)
+    zero = np.uint64(0)
+    acc = np.empty(9)
+    for i in range(words.shape[0]):
+        acc[:] = 0.0
+        carry = zero  # last bit of the word before
+        sign = -1.0  # the next change opens a run
+        for w in range(words.shape[1]):
+            word = words[i, w]
+            change = word ^ ((word << one) | carry)
+            carry = word >> top
+            while change != zero:
+                low = change & (~change + one)
+                # index of the lowest set bit
+                at = 64 * w + _trailing_zeros(low)
+                for q in range(9):
+                    acc[q] += sign * prefix[at, q]
+                sign = -sign
+                change ^= low
+        if sign > 0.0:  # a run that reaches the last texel
+            for q in range(9):
+                acc[q] += prefix[prefix.shape[0] - 1, q]
+        for c in range(3):
+            e = normals[i, 0] * acc[3 * c] + normals[i, 1] * acc[3 * c + 1] + normals[i, 2] * acc[3 * c + 2]
+            out[i, c] = max(e, 0.0)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _trailing_zeros(low):  # type: ignore[no-untyped-def]
+    """Index of the only set bit of a 64-bit word, by the exponent of its float (powers of two are exact)."""
+    n = 0
+    if low >> np.uint64(32):
+        n += 32
+        low >>= np.uint64(32)
+    if low >> np.uint64(16):
+        n += 16
+        low >>= np.uint64(16)
+    if low >> np.uint64(8):
+        n += 8
+        low >>= np.uint64(8)
+    if low >> np.uint64(4):
+        n += 4
+        low >>= np.uint64(4)
+    if low >> np.uint64(2):
+        n += 2
+        low >>= np.uint64(2)
+    if low >> np.uint64(1):
+        n += 1
+    return n

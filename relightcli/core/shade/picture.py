@@ -1,0 +1,145 @@
+"""From the radiance of receivers to pixels: a sparse matrix of barycentric weights, made once per camera."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from relightcli.core.shade.primary import Samples
+from relightcli.core.transport.shading import Surface, shading_scene, surface_at
+from relightcli.scene.model import Geometry, Material
+
+
+@dataclass(frozen=True)
+class PixelMatrix:
+    """Rows are pixels, columns receivers, in compressed rows.
+
+    start (P + 1,) int64; receiver (Z,) int32; weight (Z,) float32; texture (Z, 3) float32, the texture's colour that
+    the receivers' diffuse light is multiplied by, or (0, 3) where no material has one.
+    """
+
+    start: NDArray[np.int64]
+    receiver: NDArray[np.int32]
+    weight: NDArray[np.float32]
+    texture: NDArray[np.float32]
+
+    def used(self, count: int) -> NDArray[np.bool_]:
+        """Which of `count` receivers any pixel needs, (count,)."""
+        out = np.zeros(count, bool)
+        out[self.receiver] = True
+        return out
+
+
+def lit_surface(geometry: Geometry, samples: Samples) -> Surface:
+    """The surface at those samples that can send light to the camera; `path` is the sample, `albedo` the texture."""
+    # White materials: what comes back as albedo is the texture alone.
+    scene = shading_scene(geometry, [Material("", diffuse=(1.0, 1.0, 1.0))] * (int(geometry.material.max()) + 1))
+    n = len(samples.face)
+    return surface_at(
+        scene,
+        samples.face,
+        samples.u,
+        samples.v,
+        samples.direction.astype(np.float64),
+        np.ones((n, 3)),
+        np.arange(n, dtype=np.int64),
+    )
+
+
+def vertex_matrix(
+    geometry: Geometry,
+    samples: Samples,
+    face_normals: NDArray[np.float32],
+    front: NDArray[np.int32],
+    back: NDArray[np.int32],
+    pixels: int,
+) -> PixelMatrix:
+    """Weights of the three corners' receivers at every sample. front, back (V,): receiver of a vertex's side, or -1."""
+    seen = lit_surface(geometry, samples)
+    sample = seen.path
+    face = samples.face[sample]
+    corner = geometry.faces[face]
+    facing = np.einsum("nx,nx->n", face_normals[face], samples.direction[sample]) < 0
+    receiver = np.where(facing[:, None], front[corner], back[corner])
+    u, v = samples.u[sample], samples.v[sample]
+    weight = np.stack([1.0 - u - v, u, v], axis=1) * samples.weight[sample, None]
+    texture = np.zeros((0, 3), np.float32)
+    if geometry.textures:
+        texture = np.repeat(seen.albedo.astype(np.float32), 3, axis=0)
+    start = 3 * np.searchsorted(samples.pixel[sample], np.arange(pixels + 1))
+    return PixelMatrix(
+        start.astype(np.int64),
+        receiver.reshape(-1).astype(np.int32),
+        weight.reshape(-1).astype(np.float32),
+        texture,
+    )
+
+
+def sample_matrix(
+    pixel: NDArray[np.int32], weight: NDArray[np.float32], texture: NDArray[np.float32], pixels: int
+) -> PixelMatrix:
+    """The matrix of receivers that are camera samples themselves, in any order."""
+    order = np.argsort(pixel, kind="stable")
+    start = np.searchsorted(pixel[order], np.arange(pixels + 1))
+    return PixelMatrix(start.astype(np.int64), order.astype(np.int32), weight[order], texture[order])
+
+
+def assemble(
+    matrix: PixelMatrix,
+    diffuse: NDArray[np.float32],
+    specular: NDArray[np.float32] | None = None,
+    threads: int = 1,
+) -> NDArray[np.float32]:
+    """Pixels (P, 3) float32 from the receivers' diffuse and specular exit radiance (N, 3); textures act on diffuse."""
+    pixels = len(matrix.start) - 1
+    out = np.zeros((pixels, 3), np.float32)
+    if specular is None:
+        specular = np.zeros((0, 3), np.float32)
+    cuts = np.linspace(0, pixels, max(1, threads) + 1).astype(int)
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        list(
+            pool.map(
+                lambda a, b: _multiply(
+                    matrix.start[a : b + 1],
+                    matrix.receiver,
+                    matrix.weight,
+                    matrix.texture,
+                    diffuse,
+                    specular,
+                    out[a:b],
+                ),
+                cuts[:-1],
+                cuts[1:],
+            )
+        )
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _multiply(start, receiver, weight, texture, diffuse, specular, out):  # type: ignore[no-untyped-def]
+    textured = len(texture) > 0
+    shiny = len(specular) > 0
+    for p in range(len(out)):
+        r = g = b = np.float32(0.0)
+        for z in range(start[p], start[p + 1]):
+            k = receiver[z]
+            w = weight[z]
+            if textured:
+                r += w * texture[z, 0] * diffuse[k, 0]
+                g += w * texture[z, 1] * diffuse[k, 1]
+                b += w * texture[z, 2] * diffuse[k, 2]
+            else:
+                r += w * diffuse[k, 0]
+                g += w * diffuse[k, 1]
+                b += w * diffuse[k, 2]
+            if shiny:
+                r += w * specular[k, 0]
+                g += w * specular[k, 1]
+                b += w * specular[k, 2]
+        out[p, 0] = r
+        out[p, 1] = g
+        out[p, 2] = b

@@ -1,0 +1,168 @@
+"""What each pixel of a camera sees first: samples on a regular grid, on a finer one where the picture has edges.
+
+An edge is where neighbouring samples see different objects, depths or slopes. The result depends on the camera and the
+geometry only: every further sky reuses it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from relightcli.core.transport.camera import Film, approach
+
+BASE_GRID = 2  # samples along a pixel's side
+EDGE_GRID = 8  # the same where the picture has an edge
+
+
+class Hits(Protocol):
+    @property
+    def face(self) -> NDArray[np.int32]: ...
+    @property
+    def u(self) -> NDArray[np.float32]: ...
+    @property
+    def v(self) -> NDArray[np.float32]: ...
+    @property
+    def distance(self) -> NDArray[np.float32]: ...
+
+
+class NearestTracer(Protocol):
+    """What this module needs of a ray tracer."""
+
+    center: NDArray[np.float64]
+    scale: float
+
+    def to_local(self, points: NDArray[np.floating[Any]]) -> NDArray[np.float32]: ...
+
+    def intersect(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> Hits: ...
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Camera samples that hit something, sorted by pixel.
+
+    pixel (N,) int32 flat index; weight (N,) float32, 1 / samples of the pixel; face (N,) int32; u, v (N,) float32;
+    direction (N, 3) float32 unit, from the eye to the surface; coverage (H, W) float32.
+    """
+
+    pixel: NDArray[np.int32]
+    weight: NDArray[np.float32]
+    face: NDArray[np.int32]
+    u: NDArray[np.float32]
+    v: NDArray[np.float32]
+    direction: NDArray[np.float32]
+    coverage: NDArray[np.float32]
+
+
+def face_normals(positions: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float32]:
+    """Unit normals of the counter-clockwise sides, (F, 3); zero for faces without area."""
+    corner = positions[faces]
+    n = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    length = np.linalg.norm(n, axis=1, keepdims=True)
+    return np.divide(n, length, out=np.zeros_like(n), where=length > 0).astype(np.float32)
+
+
+def see(
+    tracer: NearestTracer,
+    film: Film,
+    face_object: NDArray[np.int32],
+    face_normals: NDArray[np.float32],
+    base_grid: int = BASE_GRID,
+    edge_grid: int = EDGE_GRID,
+) -> Samples:
+    """Traces a camera's samples. face_object (F,), face_normals (F, 3) unit tell where the picture has edges."""
+    width, height = film.width, film.height
+    base = _shoot(tracer, film, np.arange(width * height, dtype=np.int64), base_grid)
+    edges = _edges(base.face, base.distance, face_object, face_normals, width, height, base_grid)
+    fine = _shoot(tracer, film, np.flatnonzero(edges), edge_grid)
+    keep = ~np.repeat(edges.reshape(-1), base_grid * base_grid)
+    parts = [
+        (base.pixel[keep], base.face[keep], base.u[keep], base.v[keep], base.direction[keep], base_grid),
+        (fine.pixel, fine.face, fine.u, fine.v, fine.direction, edge_grid),
+    ]
+    pixel = np.concatenate([p[0] for p in parts])
+    weight = np.concatenate([np.full(len(p[0]), 1.0 / p[5] ** 2, np.float32) for p in parts])
+    face, u, v = (np.concatenate([p[k] for p in parts]) for k in (1, 2, 3))
+    direction = np.concatenate([p[4] for p in parts])
+    hit = face >= 0
+    order = np.argsort(pixel[hit], kind="stable")
+    pixel = pixel[hit][order].astype(np.int32)
+    weight = weight[hit][order]
+    coverage = np.bincount(pixel, weights=weight, minlength=width * height).reshape(height, width)
+    return Samples(
+        pixel,
+        weight,
+        face[hit][order],
+        u[hit][order],
+        v[hit][order],
+        direction[hit][order],
+        np.minimum(coverage, 1.0).astype(np.float32),
+    )
+
+
+@dataclass(frozen=True)
+class _Shots:
+    pixel: NDArray[np.int64]
+    direction: NDArray[np.float32]
+    face: NDArray[np.int32]
+    u: NDArray[np.float32]
+    v: NDArray[np.float32]
+    distance: NDArray[np.float32]
+
+
+def _shoot(tracer: NearestTracer, film: Film, pixels: NDArray[np.int64], grid: int) -> _Shots:
+    width = film.width
+    place = (np.arange(grid) + 0.5) / grid
+    pixel = np.repeat(pixels, grid * grid)
+    x = (pixels % width)[:, None] + np.tile(place, grid)[None, :]
+    y = (pixels // width)[:, None] + np.repeat(place, grid)[None, :]
+    d = directions(camera, x.reshape(-1).astype(np.float64), y.reshape(-1).astype(np.float64))
+    origin = np.broadcast_to(tracer.to_local(film.eye), d.shape)
+    hits = tracer.intersect(np.ascontiguousarray(origin), d)
+    return _Shots(pixel, d, hits.face, hits.u, hits.v, hits.distance)
+
+
+@njit(cache=True)
+def _differ(a, b, face, distance, face_object, face_normals):  # type: ignore[no-untyped-def]
+    fa, fb = face[a], face[b]
+    if fa == fb:
+        return False
+    if fa < 0 or fb < 0 or face_object[fa] != face_object[fb]:
+        return True
+    if abs(distance[a] - distance[b]) > 0.05 * min(distance[a], distance[b]):
+        return True
+    d = (
+        face_normals[fa, 0] * face_normals[fb, 0]
+        + face_normals[fa, 1] * face_normals[fb, 1]
+        + face_normals[fa, 2] * face_normals[fb, 2]
+    )
+    return d < 0.8
+
+
+@njit(cache=True)
+def _edges(face, distance, face_object, face_normals, width, height, grid):  # type: ignore[no-untyped-def]
+    """Pixels whose samples, or the nearest sample of a neighbouring pixel, see something else."""
+    area = grid * grid
+    out = np.zeros((height, width), np.bool_)
+    for y in range(height):
+        for x in range(width):
+            first = (y * width + x) * area
+            for k in range(1, area):
+                if _differ(first, first + k, face, distance, face_object, face_normals):
+                    out[y, x] = True
+            if x + 1 < width:
+                other = first + area
+                if _differ(first + grid - 1, other, face, distance, face_object, face_normals):
+                    out[y, x] = True
+                    out[y, x + 1] = True
+            if y + 1 < height:
+                other = first + width * area
+                if _differ(first + area - grid, other, face, distance, face_object, face_normals):
+                    out[y, x] = True
+                    out[y + 1, x] = True
+    return out
+

@@ -1,0 +1,81 @@
+"""Where transfer is simulated: the vertices that faces use, or the points that a fixed camera's pixels see."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Receivers:
+    """Surface points in an order that keeps neighbours together.
+
+    position (N, 3) float64 world; normal (N, 3) float32 unit, on the side that is lit; object (N,) int32;
+    vertex (N,) int32 mesh vertex, or -1; side (N,) int8: 1 front, -1 back (its normal is turned round).
+    """
+
+    position: NDArray[np.float64]
+    normal: NDArray[np.float32]
+    object: NDArray[np.int32]
+    vertex: NDArray[np.int32]
+    side: NDArray[np.int8]
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+
+def vertex_receivers(
+    positions: NDArray[np.float64],
+    normals: NDArray[np.float32],
+    faces: NDArray[np.int32],
+    vertex_object: NDArray[np.int32],
+    both_sides: NDArray[np.bool_],
+) -> Receivers:
+    """One receiver per vertex that a face uses, two where its object is lit from both sides (`both_sides`, per object)."""
+    used = np.zeros(len(positions), bool)
+    used[faces.reshape(-1)] = True
+    front = np.flatnonzero(used)
+    back = np.flatnonzero(used & both_sides[vertex_object])
+    vertex = np.concatenate([front, back]).astype(np.int32)
+    side = np.concatenate([np.ones(len(front)), -np.ones(len(back))]).astype(np.int8)
+    order = spatial_order(positions[vertex], side)
+    vertex, side = vertex[order], side[order]
+    return Receivers(
+        positions[vertex],
+        (normals[vertex] * side[:, None]).astype(np.float32),
+        vertex_object[vertex].astype(np.int32),
+        vertex,
+        side,
+    )
+
+
+def spatial_order(positions: NDArray[np.float64], side: NDArray[np.int8] | None = None) -> NDArray[np.intp]:
+    """An order along a Morton curve through the points (N, 3), sides kept apart; stable, the same at any scale."""
+    if len(positions) == 0:
+        return np.zeros(0, np.intp)
+    low = positions.min(axis=0)
+    extent = float(np.ptp(positions, axis=0).max())
+    # 20 bits an axis
+    cell = ((positions - low) * ((2.0**20 - 1.0) / extent if extent > 0 else 0.0)).astype(np.uint64)
+    code = np.zeros(len(positions), np.uint64)
+    for axis in range(3):
+        code |= _spread(cell[:, axis]) << np.uint64(axis)
+    if side is not None:
+        code |= (side < 0).astype(np.uint64) << np.uint64(63)
+    return np.argsort(code, kind="stable")
+
+
+def _spread(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Two zero bits between any two of the lowest 21 bits."""
+    x = x & np.uint64(0x1FFFFF)
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        x = (x | (x << np.uint64(shift))) & np.uint64(mask)
+    return x

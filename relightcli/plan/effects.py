@@ -1,0 +1,109 @@
+"""Which effects a scene calls for, with the evidence.
+
+Names follow interface.md: direct, shadows, one-bounce, two-bounce, specular, fields, pose. This version simulates the
+first two; a scene or a user that needs another is told so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relightcli.errors import InputError
+
+KNOWN = ("direct", "shadows", "one-bounce", "two-bounce", "specular", "fields", "pose")
+AVAILABLE = ("direct", "shadows")
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One row of the plan: what is done about an effect, and why."""
+
+    effect: str
+    simulate: bool
+    evidence: str
+
+
+def parse_effects(text: str) -> tuple[str, ...] | None:
+    """The effects named by `--effects`; None for `auto`. Raises InputError for what is unknown or not there yet."""
+    if text == "auto":
+        return None
+    if text == "all":
+        return AVAILABLE
+    names = tuple(name.strip() for name in text.split(","))
+    for name in names:
+        if name not in KNOWN:
+            raise InputError(f"--effects: expected auto, all or names out of {', '.join(KNOWN)}; found {name!r}")
+        if name not in AVAILABLE:
+            raise InputError(
+                f"--effects: {name!r} is not simulated by this version; expected names out of {', '.join(AVAILABLE)}"
+            )
+    if "direct" not in names:
+        raise InputError("--effects: 'direct' must be among them: every other effect builds on it")
+    return names
+
+
+def need_static(motions: dict[str, str], asked: tuple[str, ...] | None) -> None:
+    """Raises InputError where an object moves: its effect (fields, pose) is not simulated by this version.
+
+    Naming the effects (`--effects direct,shadows`) simulates moving objects where the scene file puts them.
+    """
+    if asked is not None:
+        return
+    for name, motion in motions.items():
+        if motion != "static":
+            effect = "fields" if motion == "rigid" else "pose"
+            raise InputError(
+                f"objects.{name}.motion is {motion!r}: this needs the effect '{effect}', which this version does not "
+                "simulate; use motion = \"static\", or --effects direct,shadows to keep the object where it stands"
+            )
+
+
+def decide(
+    asked: tuple[str, ...] | None,
+    positions: NDArray[np.float64],
+    faces: NDArray[np.int32],
+    both_sides: bool,
+    lights: int,
+) -> list[Decision]:
+    """The plan for a static scene: `direct` always, `shadows` unless nothing can block anything."""
+    direct = Decision("direct", True, "always")
+    if asked is not None:
+        return [direct, Decision("shadows", "shadows" in asked, "asked for with --effects")]
+    if both_sides:
+        return [direct, Decision("shadows", True, "objects lit from both sides")]
+    shape = blocks_nothing(positions, faces)
+    if shape is not None:
+        return [direct, Decision("shadows", False, f"{shape}: no point of it is above another point's horizon")]
+    return [direct, Decision("shadows", True, "the surfaces are not one convex body")]
+
+
+def blocks_nothing(positions: NDArray[np.float64], faces: NDArray[np.int32]) -> str | None:
+    """'flat' or 'convex' where no face has a vertex in front of it; None otherwise, or where that was not tested."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    used = positions[np.unique(faces)]
+    if len(used) < 3:
+        return None
+    scale = float(np.ptp(used, axis=0).max())
+    if not scale > 0:
+        return None
+    corners = (positions[faces] - used.mean(axis=0)) / scale
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    solid = length > 1e-12
+    normals = normals[solid] / length[solid, None]
+    level = np.einsum("ij,ij->i", normals, corners[solid, 0])
+    try:
+        hull = corners.reshape(-1, 3)[ConvexHull(corners.reshape(-1, 3)).vertices]
+    except QhullError:
+        return "flat" if len(normals) and (normals @ normals[0] > 0.999999).all() else None
+    if len(normals) * len(hull) > 4e8:
+        return None
+    for start in range(0, len(normals), 4096):
+        height = normals[start : start + 4096] @ hull.T - level[start : start + 4096, None]
+        if height.max() > 1e-6:
+            return None
+    return "convex"

@@ -1,0 +1,191 @@
+"""The block scheduler: whole blocks to local worker processes, finished ones into the store's ledger.
+
+A job knows how to do any one of its blocks and nothing of the others. Blocks are independent, write chunks that no
+other block owns, and count as done when the ledger says so. The result therefore depends neither on the number of
+workers nor on the order nor on interruptions.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Hashable, Iterable, Mapping
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from relightcli.errors import SystemFault
+
+RETRIES = 2  # new worker pools after one broke without finishing a single block
+Info = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Block:
+    """A range of receivers, rows or samples of one effect."""
+
+    id: str
+    start: int
+    stop: int
+
+
+class Worker(Protocol):
+    """What a process keeps between blocks (a ray tracer, open arrays)."""
+
+    def run(self, block: Block) -> Info:
+        """Does one block, writes its chunks, returns what it cost and what error it found."""
+        ...
+
+
+class Job(Hashable, Protocol):
+    """A small picklable description from which any process can make a worker."""
+
+    def open(self) -> Worker: ...
+
+
+class Ledger(Protocol):
+    @property
+    def done(self) -> frozenset[str]: ...
+
+    def record(self, block_id: str, info: dict[str, Any]) -> None: ...
+
+
+def split(prefix: str, count: int, size: int) -> list[Block]:
+    """Blocks of `size` items, `count` in all, named after what they cover."""
+    return [Block(f"{prefix}/{start:09d}", start, min(start + size, count)) for start in range(0, count, size)]
+
+
+def run_blocks(
+    job: Job,
+    blocks: Iterable[Block],
+    ledger: Ledger,
+    *,
+    workers: int,
+    label: str,
+    quiet: bool = False,
+) -> None:
+    """Runs every block that the ledger does not hold yet. Raises what a block raised; what is done stays done."""
+    todo = [b for b in blocks if b.id not in ledger.done]
+    total = len(todo) + len(ledger.done)
+    if not todo:
+        return
+    with _Progress(label, total, total - len(todo), quiet) as progress:
+
+        def finish(block: Block, info: Info) -> None:
+            ledger.record(block.id, info)
+            progress.step(info)
+
+        if workers <= 1 or len(todo) == 1:
+            for block in todo:
+                finish(block, _run(job, block))
+            return
+        idle_failures = 0
+        while todo:
+            before = len(todo)
+            try:
+                with _pool(min(workers, len(todo))) as pool:
+                    todo = _drain(pool, job, todo, finish)
+            except BrokenProcessPool:
+                todo = [b for b in todo if b.id not in ledger.done]
+                idle_failures = idle_failures + 1 if len(todo) == before else 0
+                if idle_failures > RETRIES:
+                    raise SystemFault(
+                        f"worker processes of {label} keep dying (killed, or out of memory); "
+                        "what is finished is kept: run again with fewer --workers"
+                    ) from None
+
+
+def _drain(
+    pool: Executor, job: Job, todo: list[Block], finish: Callable[[Block, Info], None]
+) -> list[Block]:
+    futures: Mapping[Future[Info], Block] = {pool.submit(_run, job, block): block for block in todo}
+    pending = set(futures)
+    try:
+        while pending:
+            done, pending = wait(pending, return_when=FIRST_COMPLETED)
+            for future in done:
+                finish(futures[future], future.result())
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in list((getattr(pool, "_processes", None) or {}).values()):
+            process.terminate()
+        raise
+    return []
+
+
+def _pool(workers: int) -> ProcessPoolExecutor:
+    import multiprocessing
+
+    # One BLAS thread per worker; the variables must stand before the workers import NumPy.
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ[name] = "1"
+    return ProcessPoolExecutor(
+        workers, mp_context=multiprocessing.get_context("spawn"), initializer=_start_worker, initargs=(os.getpid(),)
+    )
+
+
+def _start_worker(parent: int) -> None:
+    """A worker leaves interrupts to its parent and does not outlive it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+_opened: tuple[Job, Worker] | None = None
+
+
+def _run(job: Job, block: Block) -> Info:
+    global _opened
+    if _opened is None or _opened[0] != job:
+        _opened = None
+        _opened = (job, job.open())
+    wall, cpu = time.perf_counter(), time.process_time()
+    info = _opened[1].run(block)
+    info["seconds"] = time.perf_counter() - wall
+    info["cpu_seconds"] = time.process_time() - cpu
+    info["peak_bytes"] = float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+    return info
+
+
+def close_worker() -> None:
+    """Forgets what this process keeps between blocks, so that its memory can go."""
+    global _opened
+    _opened = None
+
+
+class _Progress:
+    """A bar on stderr with rays per second and the time left; nothing where stderr is no terminal."""
+
+    def __init__(self, label: str, total: int, done: int, quiet: bool) -> None:
+        self._bar: Any = None
+        self._rays = 0.0
+        self._start = time.perf_counter()
+        if not quiet and sys.stderr.isatty():
+            from tqdm import tqdm
+
+            self._bar = tqdm(total=total, initial=done, desc=label, unit="block", file=sys.stderr)
+
+    def __enter__(self) -> _Progress:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def step(self, info: Info) -> None:
+        if self._bar is not None:
+            self._rays += info.get("rays", 0.0)
+            rate = self._rays / (time.perf_counter() - self._start)
+            self._bar.set_postfix_str(f"{rate / 1e6:.1f} Mray/s", refresh=False)
+            self._bar.update(1)
