@@ -69,5 +69,6 @@ def sealed(folder: Path) -> bool:
 def _need_ours(folder: Path) -> None:
     """Raises StoreError unless `NAME.replaced` is a store, or what is left of one."""
     # Empty: a crash came between deleting the root metadata, the last file, and deleting the folder.
-    if not is_store(folder) and any(folder.iterdir()):
+    emptied = folder.is_dir() and not any(folder.iterdir())
+    if not is_store(folder) and not emptied:
         raise StoreError(f"{folder}: expected a relight store or nothing, found something else; move it away.")

@@ -153,8 +153,8 @@ def _walk(file: _File) -> list[tuple[dict[str, Any], NDArray[np.float64]]]:
 def _local(file: _File, node: dict[str, Any], index: int) -> NDArray[np.float64]:
     def vector(key: str, default: list[float]) -> NDArray[np.float64]:
         value = np.asarray(node.get(key, default), dtype=np.float64)
-        if value.shape != (len(default),):
-            raise file.fail(f"nodes[{index}].{key}: expected {len(default)} numbers, found {node.get(key)!r}.")
+        if value.shape != (len(default),) or not np.isfinite(value).all():
+            raise file.fail(f"nodes[{index}].{key}: expected {len(default)} finite numbers, found {node.get(key)!r}.")
         return value
 
     if "matrix" in node:  # column-major
@@ -204,7 +204,10 @@ def _primitive(file: _File, primitive: dict[str, Any]) -> Part | None:
     positions = attribute("POSITION", 3)
     count = len(positions)
     if "indices" in primitive:
-        index = _accessor(file, primitive["indices"], compressed)[:, 0].astype(np.int64)
+        listed = _accessor(file, primitive["indices"], compressed)
+        if listed.shape[1] != 1 or listed.dtype.kind != "u":
+            raise file.fail(f"indices: expected unsigned whole numbers, found {listed.shape[1]} x {listed.dtype}.")
+        index = listed[:, 0].astype(np.int64)
     else:
         index = np.arange(count)
     if len(index) and (index.min() < 0 or index.max() >= count):

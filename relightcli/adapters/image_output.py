@@ -185,7 +185,7 @@ def _memory_file(suffix: str) -> Iterator[tuple[str, Callable[[], bytes]]]:
 
     In memory where the system can do it: a full disk then shows in `write_atomic`, as an OSError that says so.
     """
-    if hasattr(os, "memfd_create"):
+    if hasattr(os, "memfd_create") and os.path.isdir("/proc/self/fd"):
         descriptor = os.memfd_create("relightcli")
         try:
             name = f"/proc/self/fd/{descriptor}"

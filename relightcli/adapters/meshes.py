@@ -55,11 +55,13 @@ def load_mesh(path: Path) -> LoadedMesh:
     data, suffix = _read(path)
     notes: list[str] = []
     try:
-        if suffix in (".gltf", ".glb"):
-            parts, found = read_gltf(path, data)
-            notes.extend(found)
-        else:
-            parts = _through_trimesh(data, suffix)
+        # Infinities that arise here are found and refused by `_finish`.
+        with np.errstate(over="ignore", invalid="ignore"):
+            if suffix in (".gltf", ".glb"):
+                parts, found = read_gltf(path, data)
+                notes.extend(found)
+            else:
+                parts = _through_trimesh(data, suffix)
     except RelightError:
         raise
     except MemoryError:

@@ -55,7 +55,8 @@ class Table:
     resolve: PathResolver
 
     def path_of(self, key: str) -> str:
-        return f"{self.where}.{key}" if self.where else key
+        plain = key if key.isprintable() and len(key) <= 128 else repr(key[:60] + "...")
+        return f"{self.where}.{plain}" if self.where else plain
 
     def fail(self, key: str, expected: str, advice: str = "") -> NoReturn:
         """Refuse the value of `key`, which may be absent."""

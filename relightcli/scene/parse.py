@@ -95,11 +95,13 @@ def _existing_file(folder: Path, written: str, kind: str, allow_outside: bool) -
                 "Move it there, or give --allow-outside."
             )
         if not real.exists():
-            raise InputError(f"expected {kind}, found no such file {str(found)!r}.")
+            raise InputError(f"expected {kind}, found {describe(written)}: no such file in {str(folder)!r}.")
         if not real.is_file():
-            raise InputError(f"expected {kind}, found {str(found)!r}, which is not a regular file.")
-    except (OSError, ValueError, RuntimeError) as error:  # a zero byte, a name too long, a loop of links
-        raise InputError(f"expected {kind}, found {describe(written)}, which is no usable path ({error}).") from None
+            raise InputError(f"expected {kind}, found {describe(written)}, which is not a regular file.")
+    except OSError as error:  # a name too long, a folder that may not be entered
+        raise InputError(f"expected {kind}, found {describe(written)} ({error.strerror}).") from None
+    except (ValueError, RuntimeError):  # a zero byte, a loop of links
+        raise InputError(f"expected {kind}, found {describe(written)}, which is no usable path.") from None
     return found
 
 

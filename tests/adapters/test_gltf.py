@@ -49,7 +49,9 @@ class Builder:
     def glb(self, path):
         text = json.dumps({**self.header, "buffers": [{"byteLength": len(self.data)}]}).encode()
         text += b" " * (-len(text) % 4)
-        body = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(self.data), b"BIN\0") + self.data
+        body = (
+            struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(self.data), b"BIN\0") + self.data
+        )
         path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body)
         return path
 
@@ -195,12 +197,14 @@ def _primitive(**changes):
         (_accessor(componentType=1), "componentType"),
         (_accessor(type="VEC2"), "expected 3 components, found 2"),
         (_node(children=[0]), "tree"),
-        (_node(matrix=[1.0, 2.0]), "16 numbers"),
+        (_node(matrix=[1.0, 2.0]), "16 finite numbers, found"),
         (_node(matrix=[1.0] * 16), "last row"),
-        (_node(scale=[1e308, 1, 1], translation=[1e999, 0, 0]), "not finite"),
+        (_node(translation=[float("inf"), 0, 0]), "3 finite numbers"),
+        (_node(matrix=[float("nan")] * 16), "16 finite numbers"),
+        (_node(scale=[1e305, 1, 1]), "above 1e"),
         (_node(mesh=3), "entry 3"),
         (_primitive(mode=9), "mode"),
-        (_primitive(indices=0), "multiple of 3|expected 0 to 2|indices"),
+        (_primitive(indices=0), "expected unsigned whole numbers"),
         (_primitive(attributes={"POSITION": 0, "NORMAL": 5}), "entry 5"),
     ],
 )

@@ -281,6 +281,20 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypat
     assert os.listdir(tmp_path) == ["a.exr"]
 
 
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full, a disk without space")
+@pytest.mark.parametrize("suffix", images.WRITE_SUFFIXES)
+def test_a_full_disk_is_an_os_error(tmp_path, suffix):
+    (tmp_path / f"a{suffix}").symlink_to("/dev/full")
+    with pytest.raises(OSError, match="No space left"):
+        write_image(tmp_path / f"a{suffix}", np.ones((64, 64, 3)))
+
+
+def test_without_memory_files_the_bytes_are_the_same(picture, monkeypatch):
+    expected = encode_image(".exr", picture)
+    monkeypatch.delattr(os, "memfd_create")
+    assert encode_image(".exr", picture) == expected
+
+
 def test_a_link_keeps_pointing_at_its_target(tmp_path):
     (tmp_path / "link.exr").symlink_to(tmp_path / "real.exr")
     write_image(tmp_path / "link.exr", np.ones((2, 2, 3)))

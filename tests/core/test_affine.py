@@ -59,7 +59,9 @@ def test_identity_changes_nothing():
     assert wound is faces
 
 
-@pytest.mark.parametrize("matrix", [np.zeros((3, 3)), np.diag([1.0, 1.0, 0.0]), np.ones((3, 3)), np.diag([1.0, 1, 1e-15])])
+@pytest.mark.parametrize(
+    "matrix", [np.zeros((3, 3)), np.diag([1.0, 1.0, 0.0]), np.ones((3, 3)), np.diag([1.0, 1, 1e-15])]
+)
 def test_flattening_matrices_are_singular(matrix):
     assert is_singular(matrix)
 

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 import zarr  # noqa: F401  before the first fork, so that children need not load it
-
 from relight_formats import StoreError, begin, open_store, worker_array
+
 from tests.formats.jobs import array_files, run
 
 CALLS = ("replace", "rename", "unlink", "mkdir", "rmdir", "fsync", "write", "ftruncate", "utime")
@@ -150,7 +150,12 @@ def random_kills(folder: Path, kills: int = 20) -> dict[str, Any]:
             resumed += ledger.exists() and ledger.stat().st_size > 0
         if array_files(path) != array_files(folder / "whole.zarr"):
             different.append(path.name)
-    in_child(lambda: (folder / "look").write_text(str([open_store(folder / f"{i}.zarr").verify() for i in range(stores)])) and None)
+    in_child(
+        lambda: (
+            (folder / "look").write_text(str([open_store(folder / f"{i}.zarr").verify() for i in range(stores)]))
+            and None
+        )
+    )
     return {
         "kills": landed,
         "kills_with_finished_blocks": resumed,

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-
 from relight_formats import Status, StoreError, begin, open_store, progress
 from relight_formats.header import read_root, write_root
 from relight_formats.lock import Lock
+
 from tests.formats.jobs import ROWS, array_files, run, start, values, write
 
 
@@ -51,7 +51,10 @@ def test_other_program_versions_do_not_disturb_a_finished_store(path: Path) -> N
     [
         ({"factor": 2.0}, "setting factor: 1.0 there, 2.0 asked for"),
         ({"settings": {"factor": 1.0}}, "setting nested: .* there, nothing asked for"),
-        ({"settings": {"factor": 1.0, "nested": {"list": [1, 3]}}}, r"setting nested.list: \[1, 2\] there, \[1, 3\] asked"),
+        (
+            {"settings": {"factor": 1.0, "nested": {"list": [1, 3]}}},
+            r"setting nested.list: \[1, 2\] there, \[1, 3\] asked",
+        ),
         ({"inputs": {"scene": "sha256:11"}}, 'input scene: "?sha256:0{12} there, "?sha256:11 asked for'),
         ({"inputs": {}}, "input scene: sha256:0+ there, nothing asked for"),
     ],

@@ -7,9 +7,13 @@ Image x in [0, 1] left to right and y in [0, 1] top to bottom belong to the dire
 (OpenEXR's ENVMAP_LATLONG). A texel is constant over its solid angle. A rotation by D about +Y, right-handed, makes the
 environment L'(d) = L(Ry(-D) d): what was at longitude lon is then at lon + D.
 
-Sampling draws a row, then a column, by luminance times solid angle, then a point uniform over the texel's solid
-angle; the density is  p(d) = Y(d) / sum_texels Y Omega  (sr^-1), with Y the luminance of |RGB|, so that negative texels
-are found too. The two running sums are float64: a one-texel sun of 1e6 leaves a sky of 1e-3 its share.
+Sampling draws a row, then a column, then a point uniform over the texel's solid angle, with the density (sr^-1)
+
+    p(d) = max(0, Y(d) - Y0) / sum_texels max(0, Y - Y0) Omega
+
+where Y is the luminance of |RGB|, so that negative texels are found too, and Y0 its mean over the sphere, or 0. With the
+mean taken off only what stands out of an even sky is looked for; a reflectance that is sampled as well finds the rest
+[Karlik 2019, MIS compensation]. The two running sums are float64.
 """
 
 from __future__ import annotations
@@ -32,16 +36,20 @@ class LatLong(NamedTuple):
 
     radiance   (H, W, 3) float32, finite
     rotation   radians about +Y
-    row_cdf    (H + 1,) float64, 0 to 1: share of luminous power above each row's upper edge; all 0 for a black map
+    row_cdf    (H + 1,) float64, 0 to 1: share of probability above each row's upper edge
     column_cdf (H, W + 1) float64: the same within a row
-    density    1 / sum Y Omega; 0 for a black map
+    floor      Y0
+    density    1 / sum max(0, Y - Y0) Omega; 0 where there is nothing to sample: a black map, or an even one
+    lit        whether any texel is not black
     """
 
     radiance: NDArray[np.float32]
     rotation: float
     row_cdf: NDArray[np.float64]
     column_cdf: NDArray[np.float64]
+    floor: float
     density: float
+    lit: bool
 
 
 def texel_solid_angles(height: int, width: int) -> NDArray[np.float64]:
@@ -53,24 +61,35 @@ def texel_solid_angles(height: int, width: int) -> NDArray[np.float64]:
     return (4.0 * math.pi / width) * math.sin(0.5 * math.pi / height) * np.cos(centre)
 
 
-def make_latlong(radiance: NDArray[np.floating[Any]], rotate_degrees: float = 0.0) -> LatLong:
-    """Prepare an environment (H, W, 3), finite, any size from 1 x 1; `rotate_degrees` about +Y, right-handed."""
+def make_latlong(radiance: NDArray[np.floating[Any]], rotate_degrees: float = 0.0, compensated: bool = True) -> LatLong:
+    """Prepare an environment (H, W, 3), finite, any size from 1 x 1; `rotate_degrees` about +Y, right-handed.
+
+    compensated: sample only what is above the mean (Y0 > 0). The other technique must then reach every direction.
+    """
     pixels = np.ascontiguousarray(radiance, np.float32)
     height, width = pixels.shape[:2]
     weight = np.abs(pixels).astype(np.float64) @ LUMINANCE
+    lit = bool(weight.any())
+    solid_angles = texel_solid_angles(height, width)
+    floor = 0.0
+    if compensated:
+        floor = float(weight.sum(axis=1) @ solid_angles) / (4.0 * math.pi)
+        # An even sky is its own mean up to rounding; what rounding leaves is no feature to look for.
+        weight = np.where(weight > floor * (1.0 + 1e-6), weight - floor, 0.0)
     column_cdf = np.zeros((height, width + 1))
     np.cumsum(weight, axis=1, out=column_cdf[:, 1:])
     row_sum = column_cdf[:, -1].copy()
-    lit = row_sum > 0
-    column_cdf[lit] /= row_sum[lit, None]
+    used = row_sum > 0
+    column_cdf[used] /= row_sum[used, None]
     row_cdf = np.zeros(height + 1)
-    np.cumsum(row_sum * texel_solid_angles(height, width), out=row_cdf[1:])
+    np.cumsum(row_sum * solid_angles, out=row_cdf[1:])
     total = float(row_cdf[-1])
     if total > 0:
         row_cdf /= total
     # Degrees are reduced before the multiplication: 360 is then exactly 0.
     rotation = math.radians(math.fmod(rotate_degrees, 360.0))
-    return LatLong(pixels, rotation, row_cdf, column_cdf, 1.0 / total if total > 0 else 0.0)
+    density = 1.0 / total if total > 0 else 0.0
+    return LatLong(pixels, rotation, row_cdf, column_cdf, floor, density, lit)
 
 
 @njit(cache=True, error_model="numpy")
@@ -93,7 +112,9 @@ def lookup(env: LatLong, d: Triple) -> Triple:
 def direction_density(env: LatLong, radiance: Triple) -> float:
     """Density (sr^-1) with which `sample` draws a direction whose radiance is the given one."""
     luminance = 0.2126 * abs(radiance[0]) + 0.7152 * abs(radiance[1]) + 0.0722 * abs(radiance[2])
-    return luminance * env.density
+    if luminance <= env.floor * (1.0 + 1e-6):
+        return 0.0
+    return (luminance - env.floor) * env.density
 
 
 @njit(cache=True, error_model="numpy")
@@ -111,7 +132,7 @@ def _bin_of(cdf: Any, u: float) -> int:
 
 @njit(cache=True, error_model="numpy")
 def sample(env: LatLong, u1: float, u2: float) -> tuple[Triple, Triple, float]:
-    """Draw a direction from u1, u2 in [0, 1): (direction, radiance, density in sr^-1). Density 0: the map is black."""
+    """Draw a direction from u1, u2 in [0, 1): (direction, radiance, density in sr^-1). Density 0: nothing."""
     if env.density == 0.0:
         return (0.0, 1.0, 0.0), (0.0, 0.0, 0.0), 0.0
     height, width = env.radiance.shape[0], env.radiance.shape[1]

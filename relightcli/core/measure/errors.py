@@ -58,7 +58,7 @@ def pixel_relative_rmse(a: Array, b: Array) -> NDArray[np.float64]:
 
 def decibels(error: NDArray[np.float64], peak: float) -> NDArray[np.float64]:
     """20 log10(peak / error), elementwise; infinite where the error is 0."""
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
         level: NDArray[np.float64] = 20 * (np.log10(np.float64(peak)) - np.log10(np.maximum(error, 0)))
     return np.where(error == 0, np.inf, level)
 

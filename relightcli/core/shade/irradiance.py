@@ -29,23 +29,23 @@ def irradiance(
     normals: NDArray[np.float32],
     prefix: NDArray[np.float64],
     threads: int = 1,
+    active: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float32]:
     """E = n . sum over visible texels of the moments, W m^-2 in the units of the map times sr, (N, 3) float32.
 
     bits (N, 6, R, R/8) uint8 visibility; normals (N, 3) unit; prefix from `moment_prefix`. Sums run in float64, so
     that a sun of 1e6 leaves the digits of a sky of 1e-3; texels on the horizon may add a little below zero, which is
-    cut off.
+    cut off. Receivers that are not `active` (N,) get 0.
     """
     words = np.ascontiguousarray(bits).reshape(len(bits), -1).view(np.uint64)
     out = np.empty((len(bits), 3), np.float32)
     normals = np.ascontiguousarray(normals, np.float32)
-    if threads <= 1:
-        _sum_runs(words, normals, prefix, out)
-        return out
-    cuts = np.linspace(0, len(bits), 4 * threads + 1).astype(int)
-    with ThreadPoolExecutor(threads) as pool:
+    if active is None:
+        active = np.ones(len(bits), bool)
+    cuts = np.linspace(0, len(bits), 4 * max(1, threads) + 1).astype(int)
+    with ThreadPoolExecutor(max(1, threads)) as pool:
         jobs = [
-            pool.submit(_sum_runs, words[a:b], normals[a:b], prefix, out[a:b])
+            pool.submit(_sum_runs, words[a:b], normals[a:b], active[a:b], prefix, out[a:b])
             for a, b in zip(cuts[:-1], cuts[1:], strict=True)
             if b > a
         ]
@@ -55,12 +55,15 @@ def irradiance(
 
 
 @njit(cache=True, nogil=True)
-def _sum_runs(words, normals, prefix, out):  # type: ignore[no-untyped-def]
+def _sum_runs(words, normals, active, prefix, out):  # type: ignore[no-untyped-def]
     one = np.uint64(1)
     top = np.uint64(63)
     zero = np.uint64(0)
     acc = np.empty(9)
     for i in range(words.shape[0]):
+        if not active[i]:
+            out[i] = np.float32(0.0)
+            continue
         acc[:] = 0.0
         carry = zero  # last bit of the word before
         sign = -1.0  # the next change opens a run

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from relightcli.core.transport.camera import Film, approach
+from relightcli.core.transport.camera import Film, approach, film_directions
 
 BASE_GRID = 2  # samples along a pixel's side
 EDGE_GRID = 8  # the same where the picture has an edge
@@ -120,10 +120,10 @@ def _shoot(tracer: NearestTracer, film: Film, pixels: NDArray[np.int64], grid: i
     pixel = np.repeat(pixels, grid * grid)
     x = (pixels % width)[:, None] + np.tile(place, grid)[None, :]
     y = (pixels // width)[:, None] + np.repeat(place, grid)[None, :]
-    d = directions(camera, x.reshape(-1).astype(np.float64), y.reshape(-1).astype(np.float64))
-    origin = np.broadcast_to(tracer.to_local(film.eye), d.shape)
-    hits = tracer.intersect(np.ascontiguousarray(origin), d)
-    return _Shots(pixel, d, hits.face, hits.u, hits.v, hits.distance)
+    d = film_directions(film, x.reshape(-1), y.reshape(-1))
+    direction = d.astype(np.float32)
+    hits = tracer.intersect(tracer.to_local(approach(film.eye, d, tracer.center, tracer.scale)), direction)
+    return _Shots(pixel, direction, hits.face, hits.u, hits.v, hits.distance)
 
 
 @njit(cache=True)

@@ -151,3 +151,18 @@ def _truncate(words, normals, directions, solid_angle, weight, resolution, index
                 kept += np.float64(flat[t]) * np.float64(flat[t])
                 k += 1
         dropped[i] = max(0.0, 1.0 - kept / total) if total > 0.0 else 0.0
+
+
+@njit(cache=True, nogil=True)
+def gather(index, value, light):  # type: ignore[no-untyped-def]
+    """Dot products of truncated transfer (N, K) with a sky's coefficients: index into light (6 R R, 3), to (N, 3)."""
+    out = np.zeros((len(index), 3), np.float32)
+    for i in range(len(index)):
+        r = g = b = 0.0
+        for k in range(index.shape[1]):
+            t, v = index[i, k], value[i, k]
+            r += v * light[t, 0]
+            g += v * light[t, 1]
+            b += v * light[t, 2]
+        out[i, 0], out[i, 1], out[i, 2] = r, g, b
+    return out

@@ -57,6 +57,12 @@ def film_direction(film: Film, x: float, y: float) -> Triple:
     return a / length, b / length, c / length
 
 
+def film_directions(film: Film, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.float64]:
+    """Unit directions through film points; x and y broadcast to (...), the result is (..., 3)."""
+    d = film.corner + x[..., None] * film.step_x + y[..., None] * film.step_y
+    return d / np.linalg.norm(d, axis=-1, keepdims=True)
+
+
 def approach(eye: NDArray[np.float64], directions: NDArray[Any], center: Any, scale: float) -> NDArray[np.float64]:
     """Ray origins (N, 3): the eye, moved along each ray to just outside the sphere that holds the scene.
 

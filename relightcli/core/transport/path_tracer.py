@@ -227,7 +227,7 @@ def _trace_paths(
             rays += len(source)
 
         last = k == bounces
-        if last and not (environment.density > 0.0 or lit_by_lights):
+        if last and not (environment.lit or lit_by_lights):
             break
         source, below, direction, throughput, density = _sample_reflection(
             scene, surface, keys, paths.samples, 3 * k + 3
@@ -240,12 +240,12 @@ def _trace_paths(
             _add_found_environment(values, k, surface.path, source, environment, face, direction, throughput, density)
             break
         hits = tracer.intersect(origins, toward)
-        if environment.density > 0.0:
+        if environment.lit:
             _add_found_environment(
                 values, k, surface.path, source, environment, hits.face, direction, throughput, density
             )
         if lit_by_lights:
-            free = np.where(hits.face >= 0, hits.distance / tracer.scale, np.inf)
+            free = np.where(hits.face >= 0, hits.distance.astype(np.float64) / tracer.scale, np.inf)
             _add_found_lights(values, k, scene, surface, source, free, direction, throughput, density)
         if not last:
             surface = surface_at(scene, hits.face, hits.u, hits.v, direction, throughput, surface.path[source])
@@ -326,7 +326,7 @@ def _sample_environment(
         d, radiance, density = sample(environment, u1, u2)
         material = surface.material[i]
         shading, geometric = _get(surface.shading, i), _get(surface.geometric, i)
-        if not _passes(scene.model[material], geometric, shading, d):
+        if density == 0.0 or not _passes(scene.model[material], geometric, shading, d):
             continue
         f, q = evaluate_and_pdf(
             scene.model[material],

@@ -1,6 +1,7 @@
 """Values of the reflectance models against their definitions, energy, reciprocity, and extreme parameters."""
 
 import math
+
 import numpy as np
 import pytest
 

@@ -91,16 +91,19 @@ def test_whole_turns_change_nothing():
     assert make_latlong(np.ones((2, 4, 3)), 360.0).rotation == 0.0
 
 
-@pytest.mark.parametrize("degrees", [0.0, 77.0])
-def test_samples_follow_luminance_times_solid_angle(degrees):
+@pytest.mark.parametrize(("degrees", "compensated"), [(0.0, False), (77.0, False), (30.0, True)])
+def test_samples_follow_luminance_times_solid_angle(degrees, compensated):
     rng = np.random.default_rng(4)
     pixels = rng.random((5, 9, 3)) ** 4
     pixels[2] = 0
     pixels[:, 4] = 0
-    env = make_latlong(pixels, degrees)
+    env = make_latlong(pixels, degrees, compensated)
     n = 1_000_000
     _, _, density, texel = sample_many(env, rng.random((n, 2)))
-    p = (pixels.astype(np.float32) @ LUMINANCE * texel_solid_angles(5, 9)[:, None]).ravel()
+    weight, omega = pixels.astype(np.float32) @ LUMINANCE, texel_solid_angles(5, 9)[:, None]
+    if compensated:
+        weight = np.maximum(weight - (weight * omega).sum() / (4 * math.pi), 0)
+    p = (weight * omega).ravel()
     expected = n * p / p.sum()
     seen = np.bincount(texel, minlength=45).astype(float)
     assert seen[expected == 0].sum() == 0
@@ -112,7 +115,7 @@ def test_samples_follow_luminance_times_solid_angle(degrees):
 
 
 def test_samples_are_uniform_within_a_texel():
-    env = make_latlong(np.ones((1, 1, 3)))
+    env = make_latlong(np.ones((1, 1, 3)), compensated=False)
     d, _, density, _ = sample_many(env, np.random.default_rng(5).random((200_000, 2)))
     np.testing.assert_allclose(density, 1 / (4 * math.pi), rtol=1e-12)
     # Archimedes: the height of a uniform point on the sphere is uniform in [-1, 1], about any axis.
@@ -124,7 +127,7 @@ def test_samples_are_uniform_within_a_texel():
 def test_one_texel_sun_leaves_the_sky_its_share():
     pixels = np.full((64, 128, 3), 1e-3)
     pixels[10, 20] = 1e6
-    env = make_latlong(pixels)
+    env = make_latlong(pixels, compensated=False)
     n = 1 << 20
     u = (np.arange(n) + 0.5) / n
     omega = texel_solid_angles(64, 128)
@@ -139,26 +142,37 @@ def test_one_texel_sun_leaves_the_sky_its_share():
     np.testing.assert_allclose(rgb[:, 1] / density, sky + 1e6 * omega[10], rtol=1e-6)
 
 
-def test_black_map_has_density_zero():
-    env = make_latlong(np.zeros((4, 8, 3)))
+@pytest.mark.parametrize("value", [0.0, 1e-30, 0.1, 1e6])
+def test_even_maps_have_nothing_to_sample(value):
+    env = make_latlong(np.full((37, 53, 3), value))
     _, rgb, density, _ = sample_many(env, np.random.default_rng(6).random((100, 2)))
     assert not rgb.any()
+    assert not density.any()
+    assert env.lit == (value > 0)
+
+
+def test_black_map_has_density_zero_without_compensation():
+    _, _, density, _ = sample_many(make_latlong(np.zeros((4, 8, 3)), compensated=False), np.full((3, 2), 0.5))
     assert not density.any()
 
 
 def test_negative_texels_are_sampled():
     pixels = np.zeros((4, 8, 3))
     pixels[1, 2] = [-1, 0, 0]
-    _, rgb, density, texel = sample_many(make_latlong(pixels), np.random.default_rng(7).random((100, 2)))
+    _, rgb, density, texel = sample_many(
+        make_latlong(pixels, compensated=False), np.random.default_rng(7).random((100, 2))
+    )
     assert (texel == 10).all()
-    # The estimator radiance/density is the integral of radiance exactly.
-    np.testing.assert_allclose(rgb[:, 0] / density, -texel_solid_angles(4, 8)[1], rtol=1e-12)
+    # The estimator radiance/density is the integral of radiance; 1e-6: two luminances of the same texel.
+    np.testing.assert_allclose(rgb[:, 0] / density, -texel_solid_angles(4, 8)[1], rtol=1e-6)
 
 
-def test_density_of_a_direction_is_the_density_of_its_sample():
+@pytest.mark.parametrize("compensated", [False, True])
+def test_density_of_a_direction_is_the_density_of_its_sample(compensated):
     pixels = np.random.default_rng(8).random((5, 9, 3), np.float32)
-    env = make_latlong(pixels, 10.0)
+    env = make_latlong(pixels, 10.0, compensated)
+    assert (env.floor > 0) == compensated
     d, rgb, density, _ = sample_many(env, np.random.default_rng(9).random((1000, 2)))
-    again = [direction_density(env, tuple(float(c) for c in x)) for x in lookup_many(env, d)]
+    again = [direction_density(env, tuple(map(float, x))) for x in lookup_many(env, d)]
     np.testing.assert_allclose(again, density, rtol=1e-6)
     np.testing.assert_array_equal(lookup_many(env, d), rgb)

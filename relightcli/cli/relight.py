@@ -1,0 +1,80 @@
+"""relightcli relight."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from relightcli.cli import options
+
+
+@click.command(name="relight")
+@click.argument("store", type=click.Path(path_type=Path))
+@click.option(
+    "-o",
+    "--output",
+    required=True,
+    help="By suffix: .exr .hdr .tif (linear), .png .jpg (display), .ply (vertices), .zarr (radiance); - is EXR to stdout.",
+)
+@click.option("--env", default=None, help="Latitude-longitude map, or the name of an environment of the scene.")
+@click.option("--env-rotate", default=0.0, help="Turn the environment about +Y, degrees, right-handed.")
+@click.option("--camera", default=None, help="Camera of the scene. Default: its first.")
+@click.option("--set", "settings", multiple=True, metavar="MATERIAL.PARAMETER=VALUE", help="Change a material.")
+@click.option(
+    "--frames", default=None, type=click.Path(path_type=Path), help="Keyframes (TOML); output name with ####."
+)
+@click.option("--layers", is_flag=True, help="Write the parts of the picture as EXR layers.")
+@click.option("--background", type=click.Choice(["none", "env"]), default="none", help="What misses show.")
+@click.option("--exposure", default=0.0, help="Stops, for display formats.")
+@click.option(
+    "--basis",
+    type=click.Choice(["visibility", "haar", "sh", "dense"]),
+    default=None,
+    help="How Lambert light is computed. Default: as the store was made.",
+)
+@click.option("--reference", is_flag=True, help="Path-trace instead; STORE may also be a scene file.")
+@click.option("--spp", default=256, type=click.IntRange(1, 1 << 20), show_default=True, help="Samples of --reference.")
+@click.option("--bounces", default=None, type=click.IntRange(0, 64), help="Interreflections. Default: the store's.")
+@click.option("--seed", default=0, help="Seed of --reference.")
+@options.workers
+@options.overwrite
+@options.report
+def command(
+    store: Path,
+    workers: int | None,
+    background: str,
+    verbose: bool,
+    quiet: bool,
+    as_json: bool,
+    **settings: Any,
+) -> None:
+    """Make pictures from STORE under any sky."""
+    from relightcli.stages.relight import Config, relight
+
+    config = Config(
+        store=store,
+        workers=workers or options.available_cores(),
+        background=background == "env",
+        quiet=quiet or as_json,
+        **settings,
+    )
+    if as_json and config.output == "-":
+        raise click.UsageError("--json and -o - both want stdout")
+    result = relight(config)
+    options.tell(result, _text(result), as_json, quiet)
+
+
+def _text(result: dict[str, Any]) -> str:
+    lines = [f"note: {note}" for note in result["notes"]]
+    output = result["output"]
+    name = output if isinstance(output, str) else f"{output[0]} .. {output[-1]}"
+    if result.get("reference"):
+        lines.append(f"{name}: {result['spp']} samples a pixel, {result['seconds']:.1f} s")
+    else:
+        lines.append(
+            f"{name}: {result['seconds']:.2f} s, of which opening {result['open_seconds']:.2f} s, "
+            f"lighting {result['lighting_seconds']:.3f} s a frame"
+        )
+    return "\n".join(lines)

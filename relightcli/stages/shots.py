@@ -1,0 +1,156 @@
+"""Frames of a sequence: `--frames SHOTS.toml`, or one frame from the command line.
+
+    format = 1
+    frames = 24                     # numbered from `first` (default 1)
+
+    [[key]]
+    frame = 1
+    env = "noon.exr"                # path relative to this file, or an environment of the scene; holds until the next
+    camera = "main"                 # holds until the next
+    env_rotate = 0                  # degrees; this and everything below is interpolated linearly between keys
+    exposure = 0
+    set = { "gold.roughness" = 0.2, "red.diffuse" = [0.6, 0.1, 0.1] }
+
+    [[key]]
+    frame = 25                      # keys may lie beyond the last frame: a full turn in 24 frames without a double
+    env_rotate = 360
+
+Before a value's first key it has that key's value, after its last key that one's.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from relightcli.errors import InputError
+
+MOST_FRAMES = 100_000
+STEPPED = ("env", "camera")
+NUMBERS = ("env_rotate", "exposure")
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One frame. `env` is a path or a name, None for the default; `settings` are texts as `--set` takes them."""
+
+    number: int
+    env: str | None
+    env_rotate: float
+    camera: str | None
+    exposure: float
+    settings: tuple[str, ...]
+
+
+def read_shots(path: Path, default: Shot) -> list[Shot]:
+    """The frames of a file; what it does not say comes from `default`. Raises InputError naming file and key."""
+    data = _load(path)
+    _known(path, "", data, {"format", "frames", "first", "key"})
+    if data.get("format") != 1:
+        raise InputError(f"{path}: format: expected 1; found {data.get('format')!r}")
+    count = _integer(path, "frames", data.get("frames"), 1, MOST_FRAMES)
+    first = _integer(path, "first", data.get("first", 1), 0, 10**9)
+    keys = data.get("key", [])
+    if not isinstance(keys, list) or not all(isinstance(k, dict) for k in keys):
+        raise InputError(f"{path}: key: expected tables [[key]]; found {keys!r}")
+    tracks: dict[str, list[tuple[float, Any]]] = {}
+    previous = None
+    for i, key in enumerate(keys):
+        where = f"key[{i}]"
+        _known(path, where, key, {"frame", "set", *STEPPED, *NUMBERS})
+        frame = _number(path, f"{where}.frame", key.get("frame"))
+        if previous is not None and frame <= previous:
+            raise InputError(f"{path}: {where}.frame: expected more than {previous:g}, the key before; found {frame:g}")
+        previous = frame
+        for name in STEPPED:
+            if name in key:
+                if not isinstance(key[name], str):
+                    raise InputError(f"{path}: {where}.{name}: expected a text; found {key[name]!r}")
+                tracks.setdefault(name, []).append((frame, key[name]))
+        for name in NUMBERS:
+            if name in key:
+                tracks.setdefault(name, []).append((frame, (_number(path, f"{where}.{name}", key[name]),)))
+        changes = key.get("set", {})
+        if not isinstance(changes, dict):
+            raise InputError(f"{path}: {where}.set: expected a table; found {changes!r}")
+        for name, value in changes.items():
+            values = value if isinstance(value, list) else [value]
+            numbers = tuple(_number(path, f"{where}.set.{name}", v) for v in values)
+            track = tracks.setdefault(f"set.{name}", [])
+            if track and len(track[0][1]) != len(numbers):
+                raise InputError(f"{path}: {where}.set.{name}: expected {len(track[0][1])} numbers; found {value!r}")
+            track.append((frame, numbers))
+    return [_shot(path, first + i, tracks, default) for i in range(count)]
+
+
+def _shot(path: Path, number: int, tracks: dict[str, list[tuple[float, Any]]], default: Shot) -> Shot:
+    env = _held(tracks.get("env"), number)
+    if env is not None and (path.parent / env).is_file():
+        env = str(path.parent / env)
+    rotate = _between(tracks.get("env_rotate"), number)
+    exposure = _between(tracks.get("exposure"), number)
+    settings = [
+        f"{name.removeprefix('set.')}={','.join(repr(v) for v in _between(track, number) or ())}"
+        for name, track in tracks.items()
+        if name.startswith("set.")
+    ]
+    return Shot(
+        number,
+        env if env is not None else default.env,
+        rotate[0] if rotate else default.env_rotate,
+        _held(tracks.get("camera"), number) or default.camera,
+        exposure[0] if exposure else default.exposure,
+        default.settings + tuple(settings),
+    )
+
+
+def _held(track: list[tuple[float, Any]] | None, number: int) -> str | None:
+    if not track:
+        return None
+    past = [value for frame, value in track if frame <= number]
+    return str(past[-1] if past else track[0][1])
+
+
+def _between(track: list[tuple[float, Any]] | None, number: int) -> tuple[float, ...] | None:
+    if not track:
+        return None
+    if number <= track[0][0]:
+        return tuple(track[0][1])
+    for (a, low), (b, high) in zip(track, track[1:], strict=False):
+        if a <= number <= b:
+            t = (number - a) / (b - a)
+            return tuple((1.0 - t) * x + t * y for x, y in zip(low, high, strict=True))
+    return tuple(track[-1][1])
+
+
+def _load(path: Path) -> dict[str, Any]:
+    try:
+        with open(path, "rb") as file:
+            return tomllib.load(file)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; expected a file of keyframes for --frames") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: is a folder; expected a file of keyframes for --frames") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not a TOML file: {error}") from None
+
+
+def _known(path: Path, where: str, table: dict[str, Any], names: set[str]) -> None:
+    for name in table:
+        if name not in names:
+            key = f"{where}.{name}" if where else name
+            raise InputError(f"{path}: {key}: unknown key; expected one of {', '.join(sorted(names))}")
+
+
+def _number(path: Path, where: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < float("inf"):
+        raise InputError(f"{path}: {where}: expected a finite number; found {value!r}")
+    return float(value)
+
+
+def _integer(path: Path, where: str, value: Any, low: int, high: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        raise InputError(f"{path}: {where}: expected a whole number from {low} to {high}; found {value!r}")
+    return value
