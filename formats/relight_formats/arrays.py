@@ -4,7 +4,6 @@ Only the subset of Zarr v3 written here is read: regular chunks in one folder, a
 checksum as the last codec, named dimensions and a unit.
 """
 
-import itertools
 import math
 import re
 from collections.abc import Iterator, Sequence
@@ -84,8 +83,17 @@ class Layout:
 
     def chunk_names(self) -> Iterator[str]:
         """File names of all chunks, in grid order, the last axis fastest: `c.0.0`; `c` for an array without axes."""
-        grid = [range(-(-n // c)) for n, c in zip(self.shape, self.chunks, strict=True)]
-        return (".".join(["c", *map(str, index)]) for index in itertools.product(*grid))
+        grid = [-(-n // c) for n, c in zip(self.shape, self.chunks, strict=True)]
+        return _chunk_names("c", grid if all(grid) else [0])
+
+
+def _chunk_names(prefix: str, grid: list[int]) -> Iterator[str]:
+    # Lazy in every axis, unlike itertools.product: an untrusted shape may ask for any number of chunks.
+    if not grid:
+        yield prefix
+        return
+    for index in range(grid[0]):
+        yield from _chunk_names(f"{prefix}.{index}", grid[1:])
 
 
 def array_metadata(

@@ -157,9 +157,13 @@ def _short(value: Any) -> str:
 
 
 def mismatch(header: dict[str, Any], asked: dict[str, Any], *, with_program: bool) -> list[str]:
-    """How a store's header differs from what is asked for now. Half-written work also binds the program version."""
+    """How a store's header differs from what is asked for now, the first few; empty when it does not.
+
+    Unfinished work binds the program version as well.
+    """
     found = [] if header["kind"] == asked["kind"] else [f"kind: {header['kind']} there, {asked['kind']} asked for"]
     if with_program and header["program"] != asked["program"]:
         found.append(f"program: {header['program']} there, {asked['program']} asked for")
     found += differences(header["inputs"], asked["inputs"], "input ")
-    return found + differences(header["settings"], asked["settings"], "setting ")
+    found += differences(header["settings"], asked["settings"], "setting ")
+    return found if len(found) <= 4 else [*found[:3], f"and {len(found) - 3} more"]

@@ -19,6 +19,9 @@ from relightcli.scene.materials import table_from_material
 from relightcli.scene.model import Geometry, RectangleLight, Scene
 from relightcli.scene.parse import FORMAT, scene_from_table
 
+# Geometry names objects and materials by their place, and the first camera is the default; JSON objects have no order.
+ORDERED = ("objects", "materials", "cameras")
+
 
 def scene_to_json(scene: Scene, geometry: Geometry | None = None) -> dict[str, Any]:
     """A description of the scene that `json.dumps` takes as it is (finite numbers, lists, strings).
@@ -58,6 +61,7 @@ def scene_to_json(scene: Scene, geometry: Geometry | None = None) -> dict[str, A
         },
         "accuracy": {"tolerance": scene.tolerance},
     }
+    description["order"] = {key: list(description[key]) for key in ORDERED}
     if geometry is not None:
         description["geometry"] = {
             "notes": list(geometry.notes),
@@ -77,8 +81,10 @@ def scene_from_json(description: Any, *, folder: Path | None = None) -> Scene:
     """
     if not isinstance(description, dict) or not isinstance(description.get("path"), str):
         raise StoreError("its scene description is damaged: expected an object with a path. Precompute it again.")
-    data = {key: value for key, value in description.items() if key not in ("path", "geometry")}
+    data = {key: value for key, value in description.items() if key not in ("path", "geometry", "order")}
     try:
+        order = Table("scene", "", description, _as_written).table("order")
+        data |= {key: _in_order(data[key], order[key]) for key in ORDERED}
         environments = Table("scene", "", data, _as_written).entries("environments")
         data["environments"] = {name: {"map": _environment(table, folder)} for name, table in environments}
         return scene_from_table(Table("scene", "", data, _as_written), Path(description["path"]))

@@ -110,7 +110,7 @@ def _object(name: str, table: Table, materials: dict[str, Any]) -> ObjectSpec:
     material = table.string("material")
     if material not in materials:
         known = f"one of {', '.join(materials)}" if materials else "a material, and the file defines none"
-        table.fail("material", known, did_you_mean(material, materials).strip() or f"Add [materials.{material}].")
+        table.fail("material", known, did_you_mean(material, materials).strip() or "Define it under [materials].")
     return ObjectSpec(
         name=name,
         mesh=table.path("mesh", "a mesh"),

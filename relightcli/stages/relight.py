@@ -245,7 +245,8 @@ class _Session:
             self._tracer = Tracer(geometry.positions, geometry.faces)
         normals = primary.face_normals(geometry.positions, geometry.faces)
         film = make_film(camera)
-        samples = primary.see(self._tracer, film, geometry.face_object, normals)
+        base = primary.TEXTURE_GRID if geometry.textures else primary.BASE_GRID
+        samples = primary.see(self._tracer, film, geometry.face_object, normals, base)
         front, back = lighting.receiver_of_vertex()
         matrix = picture.vertex_matrix(geometry, samples, normals, front, back, width * height)
         towards = _towards(film.eye, lighting.position)

@@ -1,13 +1,16 @@
 import bz2
 import struct
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from relightcli.adapters import meshes
 from relightcli.adapters.meshes import load_mesh
-from relightcli.errors import InputError
+from relightcli.errors import InputError, SystemFault
 
 SQUARE_OBJ = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 PLY = "ply\nformat ascii 1.0\nelement vertex 3\n{vertex}element face 1\n{face}end_header\n{body}"
@@ -16,6 +19,13 @@ LIST = "property list uchar int vertex_indices\n"
 TRIANGLE_PLY = PLY.format(vertex=XYZ, face=LIST, body="0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
 TRIANGLE_OFF = "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
 FACET = "facet normal 0 0 0\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+SMALL_GLTF = (
+    '{"asset": {"version": "2.0"}, "nodes": [{"mesh": 0, "scale": [1, 2, 3]}], '
+    '"meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}], '
+    '"accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}], '
+    '"bufferViews": [{"buffer": 0, "byteLength": 36}], '
+    '"buffers": [{"byteLength": 36, "uri": "data:;base64,AAAAAAAAAAAAAAAAAACAPwAAAAAAAAAAAAAAAAAAgD8AAAAA"}]}'
+)
 
 
 def load(tmp_path, name, content):
@@ -202,6 +212,55 @@ def test_a_truncated_ply_never_passes(tmp_path, length):
     assert length < len(whole)
     with pytest.raises(InputError):
         load(tmp_path, "a.ply", whole[:length])
+
+
+def test_an_unreadable_file_is_the_systems_fault(tmp_path, monkeypatch):
+    def deny(self):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_bytes", deny)
+    path = tmp_path / "a.ply"
+    path.touch()
+    with pytest.raises(SystemFault, match="Permission denied"):
+        load_mesh(path)
+
+
+BINARY_PLY = PLY.format(vertex=XYZ, face=LIST, body="").replace("ascii", "binary_little_endian").encode()
+BINARY_PLY += np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes() + b"\x03" + struct.pack("<3i", 0, 1, 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.ply", TRIANGLE_PLY.encode()),
+        ("a.ply", BINARY_PLY),
+        ("a.off", TRIANGLE_OFF.encode()),
+        ("a.obj", (SQUARE_OBJ + "vt 0 0\nvn 0 0 1\nf 1/1/1 2/1/1 3/1/1\nf 1 3 4\n").encode()),
+        ("a.stl", binary_stl([np.eye(3)])),
+        ("a.stl", f"solid x\n{FACET}endsolid x\n".encode()),
+        ("a.gltf", SMALL_GLTF.encode()),
+    ],
+)
+@settings(
+    max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, derandomize=True
+)
+@given(data=st.data())
+def test_no_damage_gives_anything_but_a_mesh_or_an_input_error(tmp_path, name, content, data):
+    damaged = bytearray(content)
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(damaged) - 1))
+        damaged[at : at + data.draw(st.integers(0, 3))] = data.draw(
+            st.binary(max_size=3) | st.sampled_from([b"-", b"9", b" "])
+        )
+        damaged = damaged or bytearray(b" ")
+    try:
+        mesh = load(tmp_path, name, bytes(damaged))
+    except InputError:
+        return
+    assert np.isfinite(mesh.positions).all()
+    assert np.isfinite(mesh.normals).all()
+    assert mesh.faces.min() >= 0
+    assert mesh.faces.max() < len(mesh.positions)
 
 
 # From the data set's own notes on its hard cases, and what holds no surface at all.

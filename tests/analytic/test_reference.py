@@ -198,7 +198,7 @@ def test_reflected_sky_is_the_quadrature(m, theta):
     # A sky with a bright and a dark half: north (-z) bright.
     pixels = np.zeros((2, 4, 3))
     pixels[:, [0, 3]] = [1.0, 2.0, 3.0]
-    light, weight = hemisphere(400, 400)
+    light, weight = hemisphere(200, 200)
     light, weight = np.concatenate([light, -light])[:, [1, 2, 0]], np.tile(weight, 2)
     radiance = np.where(light[:, 2:] < 0, [1.0, 2.0, 3.0], 0.0)
     view = direction(theta)[[1, 2, 0]]

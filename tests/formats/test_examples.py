@@ -65,7 +65,9 @@ def test_the_small_example_reads_as_it_was_written() -> None:
     np.testing.assert_array_equal(store.read("geometry/position"), np.arange(18).reshape(6, 3) / 2)
     assert store.read("geometry/faces").shape == (0, 3)
     assert store.read("geometry/scale") == 1.5
-    visible = unpack_bits(store.read("direct/visibility"), store.array("direct/visibility").attrs["bits"])
+    bits = store.array("direct/visibility").attrs["bits"]
+    assert isinstance(bits, int)
+    visible = unpack_bits(store.read("direct/visibility"), bits)
     np.testing.assert_array_equal(visible, counted % 3 > 0)
     group, _, name = "direct/transfer".rpartition("/")
     scale = store.read(f"{group}/{store.array(f'{group}/{name}').attrs['scale']}")
@@ -132,5 +134,6 @@ def test_the_checker_of_schemas_can_say_no() -> None:
         "properties": {"a": {"type": "integer", "minimum": 0}},
     }
     assert violations({"a": 1}, schema) == []
-    for bad in ([], {}, {"a": -1}, {"a": True}, {"a": "1"}):
+    wrong: list[Any] = [[], {}, {"a": -1}, {"a": True}, {"a": "1"}]
+    for bad in wrong:
         assert violations(bad, schema) != []

@@ -1,11 +1,12 @@
 """The append-only ledger: torn lines are forgotten, sound ones never."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from relight_formats.ledger import LedgerFile, read_ledger
 
-BLOCKS = [{"id": "first", "seconds": 1.5}, {"id": "second", "note": "ä\n"}, {"id": "third"}]
+BLOCKS: list[dict[str, Any]] = [{"id": "first", "seconds": 1.5}, {"id": "second", "note": "ä\n"}, {"id": "third"}]
 
 
 @pytest.fixture

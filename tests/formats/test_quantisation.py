@@ -26,8 +26,8 @@ def check(values: np.ndarray, dtype: Any, axis: Any) -> None:
     assert codes.shape == values.shape
     exact = values.astype(np.float64)
     product = codes.astype(np.float64) * scale
-    # The bound holds in real arithmetic; float64 products of an integer and a float32 are exact, and the quotient that is
-    # rounded is off by 2^-53 of itself, at most 32767 * 2^-53 < 1e-11 of a scale.
+    # The bound holds in real arithmetic; float64 products of an integer and a float32 are exact, and the quotient that
+    # is rounded is off by 2^-53 of itself, at most 32767 * 2^-53 < 1e-11 of a scale.
     assert (np.abs(exact - product) <= scale.astype(np.float64) * (0.5 + 1e-11)).all()
     back = dequantise(codes, scale)
     assert back.dtype == np.float32

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -26,9 +27,14 @@ def interrupt(path: Path, factor: float = 1.0, **changes: Any) -> None:
     """Leave unfinished work with one block of three."""
     writer = start(path, factor, **changes)
     assert writer is not None
-    with pytest.raises(KeyboardInterrupt), writer:
-        write(writer, factor, blocks=1)
-        raise KeyboardInterrupt
+
+    def killed_by_the_user() -> None:
+        with writer:
+            write(writer, factor, blocks=1)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        killed_by_the_user()
 
 
 def test_a_finished_store_is_left_alone_and_its_time_stamp_refreshed(path: Path) -> None:
@@ -85,12 +91,13 @@ def test_resuming_keeps_finished_blocks_and_ends_in_the_same_bytes(path: Path, t
     before = chunk.stat().st_mtime_ns
     writer = start(path)
     assert writer is not None
-    assert writer.status is Status.RESUMED
+    statuses = [writer.status]
     assert writer.done == {"direct/0"}
     with writer:
         write(writer)
         writer.commit({})
-    assert writer.status is Status.DONE
+    statuses.append(writer.status)
+    assert statuses == [Status.RESUMED, Status.DONE]
     run(tmp_path / "reference.zarr")
     assert array_files(path) == array_files(tmp_path / "reference.zarr")
     assert (path / "direct/transfer/c.0.0").stat().st_mtime_ns == before
@@ -160,7 +167,7 @@ def test_what_is_no_relight_store_is_never_touched(path: Path, suffix: str, over
     mine = path.with_name(path.name + suffix)
     mine.mkdir()
     (mine / "thesis.txt").write_text("years of work")
-    with pytest.raises(StoreError, match="move it|another output"):
+    with pytest.raises(StoreError, match=r"move it|another output"):
         start(path, overwrite=overwrite)
     assert (mine / "thesis.txt").read_text() == "years of work"
     assert not path.with_name("store.zarr.lock").exists()
@@ -248,8 +255,8 @@ def test_a_forked_child_does_not_keep_the_lock(tmp_path: Path) -> None:
         holder.wait()
         Lock(path).release()
     finally:
-        os.killpg(holder.pid, 9)
-        holder.stdout.close()
+        os.killpg(holder.pid, signal.SIGKILL)
+        holder.communicate()
 
 
 def test_a_missing_folder_is_a_system_error_that_names_it(tmp_path: Path) -> None:
@@ -276,7 +283,7 @@ def test_a_symbolic_link_to_a_store_is_followed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("settings", [{"x": float("nan")}, {"x": {1: 2}}, {"x": object()}])
 def test_settings_are_plain_json(path: Path, settings: dict[str, Any]) -> None:
-    with pytest.raises((ValueError, TypeError), match="settings.x"):
+    with pytest.raises((ValueError, TypeError), match=r"settings\.x"):
         begin(path, "test", settings=settings, inputs={}, program="test 1")
     assert list(path.parent.iterdir()) == []
 
@@ -285,3 +292,27 @@ def test_numpy_scalars_and_tuples_mean_the_same_as_plain_values(path: Path) -> N
     run(path)
     same = {"factor": np.float64(1.0), "nested": {"list": (np.int32(1), 2)}}
     assert start(path, settings=same) is None
+
+
+def test_a_finished_name_without_a_commit_mark_is_refused_and_can_be_replaced(path: Path) -> None:
+    interrupt(path)
+    path.with_name("store.zarr.partial").rename(path)
+    with pytest.raises(StoreError, match="carries no commit mark"):
+        start(path)
+    assert run(path, overwrite=True)
+    assert open_store(path).verify() == []
+
+
+def test_a_store_that_was_moved_aside_and_lost_its_successor_comes_back(path: Path) -> None:
+    run(path)
+    path.rename(path.with_name("store.zarr.replaced"))
+    assert start(path) is None
+    assert open_store(path).verify() == []
+    assert [p.name for p in path.parent.iterdir()] == ["store.zarr"]
+
+
+def test_a_long_list_of_differences_is_cut_short(path: Path) -> None:
+    run(path)
+    with pytest.raises(StoreError, match="and 17 more") as error:
+        start(path, settings={f"option{i}": i for i in range(18)})
+    assert len(str(error.value)) < 600

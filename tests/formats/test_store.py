@@ -55,7 +55,7 @@ def test_the_header_repeats_the_conventions(sound: Path) -> None:
 
 
 def test_stores_cannot_be_written_through(sound: Path) -> None:
-    with pytest.raises(ValueError, match="read-only|read only"):
+    with pytest.raises(ValueError, match=r"read-only|read only"):
         open_store(sound).array("direct/transfer")[0, 0] = 1
 
 

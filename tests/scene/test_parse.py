@@ -7,7 +7,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from relightcli.errors import InputError
+from relightcli.errors import InputError, SystemFault
 from relightcli.scene import parse
 from relightcli.scene.model import Camera, Material, RectangleLight, Scene, SphereLight
 from relightcli.scene.parse import load_scene
@@ -246,7 +246,11 @@ def _section(name: str, fields: dict[str, str], lines: str) -> str:
             "materials.m",
             "1, 1, 1.1",
         ),
-        (_material('diffuse_texture = "none.png"'), "materials.m.diffuse_texture", "expected a texture, found 'none.png' (string): no such"),
+        (
+            _material('diffuse_texture = "none.png"'),
+            "materials.m.diffuse_texture",
+            "expected a texture, found 'none.png' (string): no such",
+        ),
         (_material("diffuse_texture = false"), "materials.m.diffuse_texture", "expected a string"),
         (_material("adjustable = 'yes'"), "materials.m.adjustable", "true or false"),
         # lights
@@ -265,7 +269,11 @@ def _section(name: str, fields: dict[str, str], lines: str) -> str:
         (_rectangle("edge_v = [-2, 0, 0]"), "lights.l.edge_v", "not parallel"),
         (_rectangle("-edge_v"), "lights.l.edge_v", "found nothing"),
         # environments
-        (MINIMAL + '[environments.e]\nmap = "none.exr"\n', "environments.e.map", "an environment map, found 'none.exr' (string): no such"),
+        (
+            MINIMAL + '[environments.e]\nmap = "none.exr"\n',
+            "environments.e.map",
+            "an environment map, found 'none.exr' (string): no such",
+        ),
         (MINIMAL + "[environments.e]\n", "environments.e.map", "found nothing"),
         (MINIMAL + '[environments.e]\nmap = "sky.exr"\nrotate = 1\n', "environments.e.rotate", "unknown key"),
         # cameras
@@ -313,6 +321,16 @@ def test_files_that_are_no_scene(scene_folder, monkeypatch):
     monkeypatch.setattr(parse, "MAX_FILE_BYTES", 10)
     with pytest.raises(InputError, match="at most 10"):
         load_scene(write(scene_folder, MINIMAL))
+
+
+def test_an_unreadable_file_is_the_systems_fault(scene_folder, monkeypatch):
+    def deny(self):
+        raise PermissionError(13, "Permission denied")
+
+    path = write(scene_folder, MINIMAL)
+    monkeypatch.setattr(Path, "read_bytes", deny)
+    with pytest.raises(SystemFault, match="Permission denied"):
+        load_scene(path)
 
 
 def test_outside_files_need_permission(scene_folder):

@@ -11,9 +11,9 @@ Sampling draws a row, then a column, then a point uniform over the texel's solid
 
     p(d) = max(0, Y(d) - Y0) / sum_texels max(0, Y - Y0) Omega
 
-where Y is the luminance of |RGB|, so that negative texels are found too, and Y0 its mean over the sphere, or 0. With the
-mean taken off only what stands out of an even sky is looked for; a reflectance that is sampled as well finds the rest
-[Karlik 2019, MIS compensation]. The two running sums are float64.
+where Y is the luminance of |RGB|, so that negative texels are found too, and Y0 its mean over the sphere, or 0. With
+the mean taken off only what stands out of an even sky is looked for; a reflectance that is sampled as well finds the
+rest [Karlik 2019, MIS compensation]. The two running sums are float64.
 """
 
 from __future__ import annotations

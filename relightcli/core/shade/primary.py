@@ -13,10 +13,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from relightcli.core.transport.camera import Film, approach, film_directions
+from relightcli.core.transport.camera import Film, film_direction
 
-BASE_GRID = 2  # samples along a pixel's side
-EDGE_GRID = 8  # the same where the picture has an edge
+BASE_GRID = 1  # samples along a pixel's side; receivers' light is smooth between them
+EDGE_GRID = 6  # the same where the picture has an edge
+TEXTURE_GRID = 3  # the least where surfaces have textures
 
 
 class Hits(Protocol):
@@ -88,18 +89,18 @@ def see(
     weight = np.concatenate([np.full(len(p[0]), 1.0 / p[5] ** 2, np.float32) for p in parts])
     face, u, v = (np.concatenate([p[k] for p in parts]) for k in (1, 2, 3))
     direction = np.concatenate([p[4] for p in parts])
-    hit = face >= 0
-    order = np.argsort(pixel[hit], kind="stable")
-    pixel = pixel[hit][order].astype(np.int32)
-    weight = weight[hit][order]
+    hit = np.flatnonzero(face >= 0)
+    hit = hit[np.argsort(pixel[hit], kind="stable")]
+    pixel = pixel[hit].astype(np.int32)
+    weight = weight[hit]
     coverage = np.bincount(pixel, weights=weight, minlength=width * height).reshape(height, width)
     return Samples(
         pixel,
         weight,
-        face[hit][order],
-        u[hit][order],
-        v[hit][order],
-        direction[hit][order],
+        face[hit],
+        u[hit],
+        v[hit],
+        direction[hit],
         np.minimum(coverage, 1.0).astype(np.float32),
     )
 
@@ -115,15 +116,32 @@ class _Shots:
 
 
 def _shoot(tracer: NearestTracer, film: Film, pixels: NDArray[np.int64], grid: int) -> _Shots:
-    width = film.width
-    place = (np.arange(grid) + 0.5) / grid
+    count = len(pixels) * grid * grid
     pixel = np.repeat(pixels, grid * grid)
-    x = (pixels % width)[:, None] + np.tile(place, grid)[None, :]
-    y = (pixels // width)[:, None] + np.repeat(place, grid)[None, :]
-    d = film_directions(film, x.reshape(-1), y.reshape(-1))
-    direction = d.astype(np.float32)
-    hits = tracer.intersect(tracer.to_local(approach(film.eye, d, tracer.center, tracer.scale)), direction)
+    direction = np.empty((count, 3), np.float32)
+    origin = np.empty((count, 3), np.float32)
+    _film_rays(film, pixels, grid, tracer.center, tracer.scale, origin, direction)
+    hits = tracer.intersect(origin, direction)
     return _Shots(pixel, direction, hits.face, hits.u, hits.v, hits.distance)
+
+
+@njit(cache=True, error_model="numpy")
+def _film_rays(film, pixels, grid, center, scale, origin, direction):  # type: ignore[no-untyped-def]
+    """Rays through a grid of points of every pixel; origins as `camera.approach` has them, in the tracer's frame."""
+    eye, n = film.eye, 0
+    for pixel in pixels:
+        x, y = pixel % film.width, pixel // film.width
+        for i in range(grid):
+            for j in range(grid):
+                d = film_direction(film, x + (j + 0.5) / grid, y + (i + 0.5) / grid)
+                ahead = -2.0 / scale
+                for k in range(3):
+                    ahead += d[k] * (center[k] - eye[k])
+                ahead = max(ahead, 0.0)
+                for k in range(3):
+                    direction[n, k] = d[k]
+                    origin[n, k] = (eye[k] + ahead * d[k] - center[k]) * scale
+                n += 1
 
 
 @njit(cache=True)

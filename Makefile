@@ -1,0 +1,46 @@
+# make demo | test | lint | bench | recipes | clean. Each sets up what it needs in .venv.
+PYTHON ?= python3
+VENV ?= .venv
+BIN = $(VENV)/bin
+
+.PHONY: demo test lint bench recipes clean
+
+$(VENV)/.base: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --upgrade pip
+	$(BIN)/pip install --quiet --editable .
+	touch $@
+
+$(VENV)/.test: $(VENV)/.base
+	$(BIN)/pip install --quiet --editable '.[test]'
+	touch $@
+
+$(VENV)/.lint: $(VENV)/.test
+	$(BIN)/pip install --quiet --editable '.[lint]'
+	touch $@
+
+$(VENV)/.bench: $(VENV)/.base
+	$(BIN)/pip install --quiet --editable '.[bench]'
+	touch $@
+
+demo: $(VENV)/.base  ## the main job on a built-in scene; leaves demo/index.html
+	$(MAKE) --no-print-directory -C recipes/demo RELIGHTCLI=$(abspath $(BIN))/relightcli PYTHON=$(abspath $(BIN))/python OUT=$(abspath demo)
+
+test: $(VENV)/.test
+	$(BIN)/python -m pytest -q
+
+lint: $(VENV)/.lint
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: $(VENV)/.bench
+	$(BIN)/python -m benchmarks
+
+recipes: $(VENV)/.base  ## every recipe end to end; each ends in a check
+	for r in recipes/*/Makefile; do \
+	  $(MAKE) --no-print-directory -C $$(dirname $$r) RELIGHTCLI=$(abspath $(BIN))/relightcli PYTHON=$(abspath $(BIN))/python OUT=$(abspath build/recipes)/$$(basename $$(dirname $$r)) || exit 1; \
+	done
+
+clean:
+	rm -rf $(VENV) demo build

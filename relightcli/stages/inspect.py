@@ -1,0 +1,73 @@
+"""Stage inspect: what a store holds, what it cost, and whether it is sound. Changes nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import relight_formats as formats
+from relightcli.errors import StoreError
+
+SUMMED = ("seconds", "cpu_seconds", "trace_seconds", "rays", "bytes", "checked", "wrong", "inferred", "bits")
+
+
+def inspect(path: Path, verify: bool) -> dict[str, Any]:
+    """Describes a finished or an unfinished store. Raises StoreError where there is neither, or it cannot be read."""
+    if not path.exists() and not path.name.endswith(".partial"):
+        partial = path.with_name(path.name + ".partial")
+        if partial.exists():
+            return _unfinished(partial, verify)
+    if path.name.endswith(".partial"):
+        return _unfinished(path, verify)
+    store = formats.open_store(path)
+    sizes = store.sizes()
+    result: dict[str, Any] = {
+        "store": str(path),
+        "complete": True,
+        "kind": store.kind,
+        "program": store.program,
+        "created": store.created,
+        "settings": store.settings,
+        "inputs": store.inputs,
+        "fingerprint": store.fingerprint,
+        "plan": store.attrs.get("plan", []),
+        "bytes": sum(size.stored for size in sizes.values()),
+        "raw_bytes": sum(size.raw for size in sizes.values()),
+        "arrays": {
+            name: {
+                "shape": list(store.layouts[name].shape),
+                "dtype": store.layouts[name].data_type,
+                "chunks": list(store.layouts[name].chunks),
+                "bytes": size.stored,
+                "raw_bytes": size.raw,
+            }
+            for name, size in sizes.items()
+        },
+        "cost": _cost(store.blocks),
+        "summary": store.summary,
+    }
+    if verify:
+        result["problems"] = store.verify()
+    return result
+
+
+def _unfinished(path: Path, verify: bool) -> dict[str, Any]:
+    if verify:
+        raise StoreError(f"{path}: is not finished, so there is nothing to verify; run its command again to finish it")
+    return {"store": str(path), "complete": False, **formats.progress(path)}
+
+
+def _cost(blocks: list[dict[str, Any]]) -> dict[str, Any]:
+    """Totals per effect, the part of a block's name before the slash."""
+    cost: dict[str, Any] = {}
+    for block in blocks:
+        effect = cost.setdefault(block["id"].partition("/")[0], {"blocks": 0, "peak_bytes": 0.0})
+        effect["blocks"] += 1
+        effect["peak_bytes"] = max(effect["peak_bytes"], block.get("peak_bytes", 0.0))
+        for name in SUMMED:
+            if name in block:
+                effect[name] = effect.get(name, 0.0) + block[name]
+    for effect in cost.values():
+        if effect.get("checked"):
+            effect["wrong_bits"] = effect["wrong"] / effect["checked"] * effect["inferred"] / effect["bits"]
+    return cost
