@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+
 from relight_formats import begin, fingerprint_json, pack_bits, quantise
 
 VERTICES, LIGHTS = 6, 10

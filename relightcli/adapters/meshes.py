@@ -206,8 +206,8 @@ def _ply(data: bytes) -> list[dict[str, Any]]:
         raise ValueError(
             f"the header promises {sum(counts):,} elements, the file has room for {room:,}; is it cut short?"
         )
-    # trimesh can split vertices along seams of the texture, but then permutes them away from their normals. Needed
-    # only where texture coordinates belong to faces; the normals are then computed.
+    # trimesh can split vertices along seams of the texture and drop unused ones, but leaves their normals as they
+    # were. Needed only where texture coordinates belong to faces; the normals are then computed.
     per_face = re.search(r"(?m)^property\s+list\s+\S+\s+\S+\s+texcoord", header) is not None
     loaded = load_ply(io.BytesIO(data), skip_materials=True, fix_texture=per_face)
     if per_face:

@@ -73,7 +73,8 @@ class Tracer:
         if self.empty or len(origins) == 0:
             return np.zeros(len(origins), bool)
         found: NDArray[np.int32] = self._scene.run(origins, directions, dists=max_distance, query="OCCLUDED")
-        return found == 0
+        blocked: NDArray[np.bool_] = found == 0
+        return blocked
 
     def intersect(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> Hits:
         """Nearest hit of every ray. origins, directions (N, 3) float32 in the normalised frame."""

@@ -64,7 +64,9 @@ def run(arguments: list[str]) -> int:
         error.show()
         return 2
     except (click.exceptions.Abort, KeyboardInterrupt):
-        click.echo("relightcli: interrupted; finished blocks are kept, run the same command again to continue", err=True)
+        click.echo(
+            "relightcli: interrupted; finished blocks are kept, run the same command again to continue", err=True
+        )
         return INTERRUPTED
     except click.ClickException as error:
         error.show()

@@ -20,7 +20,7 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
-def output(help: str) -> Callable[[Command], Command]:  # noqa: A002
+def output(help: str) -> Callable[[Command], Command]:
     return click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help=help)
 
 
@@ -31,7 +31,9 @@ def workers(command: Command) -> Command:
 
 
 def overwrite(command: Command) -> Command:
-    return click.option("--overwrite", is_flag=True, help="Replace a store made from other inputs or settings.")(command)
+    return click.option("--overwrite", is_flag=True, help="Replace a store made from other inputs or settings.")(
+        command
+    )
 
 
 def report(command: Command) -> Command:

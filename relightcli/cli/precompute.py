@@ -27,7 +27,13 @@ from relightcli.cli import options
     show_default=True,
     help="visibility (exact), or for Lambert surfaces in addition haar, sh or dense transfer.",
 )
-@click.option("--coefficients", default=128, show_default=True, help="Haar coefficients kept per receiver.")
+@click.option("--coefficients", default=128, show_default=True, help="Haar coefficients kept per receiver, at most.")
+@click.option(
+    "--haar-tolerance",
+    default=0.0,
+    show_default=True,
+    help="Keep only as many of them as leave this relative RMS of a receiver's transfer out.",
+)
 @click.option("--sh-order", default=6, show_default=True, help="Bands of the spherical harmonics.")
 @click.option("--bounces", default=0, show_default=True, help="Interreflections to simulate (this version: 0).")
 @click.option("--seed", default=0, show_default=True, help="Seed of the random checks.")
@@ -57,7 +63,8 @@ def _text(result: dict[str, Any]) -> str:
     lines = [f"note: {note}" for note in result["notes"]]
     if result.get("dry_run"):
         lines += [
-            f"{'simulate' if row['simulate'] else 'skip':9}{row['effect']:12}{row['evidence']}" for row in result["plan"]
+            f"{'simulate' if row['simulate'] else 'skip':9}{row['effect']:12}{row['evidence']}"
+            for row in result["plan"]
         ]
         cost = result["predicted"]
         lines.append(

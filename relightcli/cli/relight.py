@@ -16,7 +16,7 @@ from relightcli.cli import options
     "-o",
     "--output",
     required=True,
-    help="By suffix: .exr .hdr .tif (linear), .png .jpg (display), .ply (vertices), .zarr (radiance); - is EXR to stdout.",
+    help="By suffix: .exr .hdr .tif linear, .png .jpg display, .ply vertices, .zarr radiance; - is EXR to stdout.",
 )
 @click.option("--env", default=None, help="Latitude-longitude map, or the name of an environment of the scene.")
 @click.option("--env-rotate", default=0.0, help="Turn the environment about +Y, degrees, right-handed.")

@@ -57,7 +57,7 @@ def need_static(motions: dict[str, str], asked: tuple[str, ...] | None) -> None:
             effect = "fields" if motion == "rigid" else "pose"
             raise InputError(
                 f"objects.{name}.motion is {motion!r}: this needs the effect '{effect}', which this version does not "
-                "simulate; use motion = \"static\", or --effects direct,shadows to keep the object where it stands"
+                'simulate; use motion = "static", or --effects direct,shadows to keep the object where it stands'
             )
 
 
@@ -66,7 +66,6 @@ def decide(
     positions: NDArray[np.float64],
     faces: NDArray[np.int32],
     both_sides: bool,
-    lights: int,
 ) -> list[Decision]:
     """The plan for a static scene: `direct` always, `shadows` unless nothing can block anything."""
     direct = Decision("direct", True, "always")

@@ -100,9 +100,7 @@ def run_blocks(
                     ) from None
 
 
-def _drain(
-    pool: Executor, job: Job, todo: list[Block], finish: Callable[[Block, Info], None]
-) -> list[Block]:
+def _drain(pool: Executor, job: Job, todo: list[Block], finish: Callable[[Block, Info], None]) -> list[Block]:
     futures: Mapping[Future[Info], Block] = {pool.submit(_run, job, block): block for block in todo}
     pending = set(futures)
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,8 @@ from numpy.typing import NDArray
 
 from relightcli.scene.shapes import Mesh, arc_beam, join, lathe, patch, rounded, torus_knot, tube
 
-_COURT_CELLS = 128
-_COURT_EVEN = 3.5  # metres from the middle that have evenly spaced cells
+_COURT_CELLS = 148
+_COURT_EVEN = 3.2  # metres from the middle that have evenly spaced cells
 _COURT_RIM = 12  # cells beyond them on either side, each wider than the one before
 _COURT_HALF = 100.0  # metres from the middle to the edge, far enough to reach the horizon
 _TEXTURE = 1024
@@ -71,8 +72,8 @@ diffuse = [0.20, 0.21, 0.23]
 
 [materials.gold]
 model = "cook-torrance"
-diffuse = [0.10, 0.06, 0.015]
-specular = [0.85, 0.60, 0.22]
+diffuse = [0.10, 0.055, 0.012]
+specular = [0.90, 0.58, 0.20]
 f0 = 0.9
 roughness = 0.25
 adjustable = true
@@ -106,15 +107,22 @@ map = "sky-overcast.exr"
 
 [cameras.main]
 eye = [1.3, 2.3, 6.3]
-target = [0.05, 0.74, -0.2]
-fov = 35
+target = [0.16, 0.86, -0.2]
+fov = 34
 size = [640, 480]
 
 [cameras.close]
-eye = [-2.2, 1.5, 3.2]
-target = [0.1, 0.75, 0.0]
+eye = [-2.3, 1.5, 4.4]
+target = [-0.12, 0.8, 0.2]
 fov = 36
 size = [640, 480]
+
+# What main sees, in a quarter of the pixels: for sequences and the reference.
+[cameras.small]
+eye = [1.3, 2.3, 6.3]
+target = [0.16, 0.86, -0.2]
+fov = 34
+size = [320, 240]
 
 [accuracy]
 tolerance = 0.02
@@ -137,8 +145,8 @@ def write_demo_scene(folder: str | Path) -> Path:
         write_atomic(folder / f"{name}.ply", _ply(mesh))
     write_atomic(folder / "court.obj", _court().encode())
     write_image(folder / "paving.png", _paving())
-    write_image(folder / "sky-noon.exr", sky_latlong(55.0, 50.0, 3.0, ground=_SAND))
-    write_image(folder / "sky-morning.exr", sky_latlong(20.0, 280.0, 3.0, ground=_SAND))
+    write_image(folder / "sky-noon.exr", sky_latlong(50.0, 310.0, 3.0, ground=_SAND))
+    write_image(folder / "sky-morning.exr", sky_latlong(20.0, 252.0, 3.0, ground=_SAND))
     write_image(folder / "sky-overcast.exr", sky_latlong(45.0, overcast=True, ground=_SAND))
     scene = folder / "scene.toml"
     write_atomic(scene, _SCENE.encode())
@@ -183,8 +191,8 @@ def _hoop() -> Mesh:
     """An upright ring that stands on the ground."""
     t = 2 * math.pi * np.arange(96) / 96
     centers = 0.36 * np.stack([np.cos(t), np.sin(t), np.zeros_like(t)], axis=1)
-    positions, faces = tube(centers, 0.035, 12)
-    return positions + np.array([0.0, 0.395, 0.0]), faces
+    positions, faces = tube(centers, 0.045, 12)
+    return positions + np.array([0.0, 0.405, 0.0]), faces
 
 
 def _spread(t: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -214,8 +222,8 @@ def _paving() -> NDArray[np.float32]:
     x, z = np.meshgrid(_spread(t), _spread(t), indexing="xy")
     radius, angle = np.hypot(x, z), np.arctan2(z, x)
     dark = (np.floor(radius / 0.42) + np.floor(angle * 24 / (2 * math.pi))) % 2
-    light, deep = np.array([0.58, 0.53, 0.45]), np.array([0.36, 0.33, 0.29])
-    rim = np.array([0.27, 0.24, 0.21])
+    light, deep = np.array([0.60, 0.53, 0.42]), np.array([0.31, 0.26, 0.21])
+    rim = np.array([0.24, 0.20, 0.16])
     colour = light + dark[..., None] * (deep - light)
     colour[radius > 7 * 0.42] = rim
     colour[radius > 3.15] = _SAND
@@ -234,3 +242,7 @@ def _ply(mesh: Mesh) -> bytes:
     corners = np.empty(len(faces), dtype=[("n", "u1"), ("v", "<i4", 3)])
     corners["n"], corners["v"] = 3, faces
     return header.encode() + positions.astype("<f4").tobytes() + corners.tobytes()
+
+
+if __name__ == "__main__":
+    print(write_demo_scene(sys.argv[1]))

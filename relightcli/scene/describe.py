@@ -19,8 +19,8 @@ from relightcli.scene.materials import table_from_material
 from relightcli.scene.model import Geometry, RectangleLight, Scene
 from relightcli.scene.parse import FORMAT, scene_from_table
 
-# Geometry names objects and materials by their place, and the first camera is the default; JSON objects have no order.
-ORDERED = ("objects", "materials", "cameras")
+# Geometry refers to objects and materials by position and the first camera is the default, but a store sorts JSON keys.
+ORDERED = ("objects", "materials", "lights", "environments", "cameras")
 
 
 def scene_to_json(scene: Scene, geometry: Geometry | None = None) -> dict[str, Any]:
@@ -83,13 +83,23 @@ def scene_from_json(description: Any, *, folder: Path | None = None) -> Scene:
         raise StoreError("its scene description is damaged: expected an object with a path. Precompute it again.")
     data = {key: value for key, value in description.items() if key not in ("path", "geometry", "order")}
     try:
-        order = Table("scene", "", description, _as_written).table("order")
-        data |= {key: _in_order(data[key], order[key]) for key in ORDERED}
+        data |= _in_order(data, description.get("order"))
         environments = Table("scene", "", data, _as_written).entries("environments")
         data["environments"] = {name: {"map": _environment(table, folder)} for name, table in environments}
         return scene_from_table(Table("scene", "", data, _as_written), Path(description["path"]))
     except InputError as error:
         raise StoreError(f"its scene description is damaged: {error} Precompute it again.") from None
+
+
+def _in_order(data: dict[str, Any], order: Any) -> dict[str, Any]:
+    """The ORDERED tables with their names in the scene file's order."""
+    tables = {}
+    for key in ORDERED:
+        table, names = data.get(key), order.get(key) if isinstance(order, dict) else None
+        if not isinstance(table, dict) or not isinstance(names, list) or sorted(map(str, names)) != sorted(table):
+            raise InputError(f"order.{key}: expected the names of {key}, found {names!r}.")
+        tables[key] = {name: table[name] for name in names}
+    return tables
 
 
 def _counts(geometry: Geometry, owner: NDArray[np.int32]) -> dict[str, int]:

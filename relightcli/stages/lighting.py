@@ -1,26 +1,28 @@
-"""A transfer store made ready to light: its scene, its receivers and their visibility, and exit radiance under a sky."""
+"""A transfer store made ready to light: scene, receivers, visibility, and their exit radiance under a sky."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import relight_formats as formats
-from relightcli.core.brdf.models import pack_materials
+from relightcli.core.brdf.models import SPECULAR, pack_materials
 from relightcli.core.lights.environment import SkyCube, latlong_to_cube, splat
 from relightcli.core.shade.glossy import sky_tree, specular_radiance
 from relightcli.core.shade.irradiance import irradiance, moment_prefix
+from relightcli.core.shade.local import local_radiance
 from relightcli.core.sphere import haar, sh
+from relightcli.core.transport.local_lights import pack_lights
 from relightcli.errors import InputError, StoreError
 from relightcli.scene.describe import scene_from_json
 from relightcli.scene.model import Geometry, Material, Scene
 
 IN_MEMORY = 1 << 30  # visibility up to this size stays in memory between frames
-FINE_SKY = 256  # texels a side of the sky that narrow lobes look into
 BLACK = (0.0, 0.0, 0.0)
 
 
@@ -34,7 +36,7 @@ class Radiance:
 
 def read_scene(store: formats.Store) -> tuple[Scene, Geometry]:
     """The scene that a transfer store was made from, as the store keeps it."""
-    read = store.read
+    read: Any = store.read
     scene = scene_from_json(store.attrs["scene"], folder=store.path.parent)
     textures = {int(name.split("/")[1]): read(name) for name in store.names() if name.startswith("textures/")}
     geometry = Geometry(
@@ -59,21 +61,19 @@ class LightingStore:
         self.store = formats.open_store(path, "transfer")
         self.threads = threads
         self.scene, self.geometry = read_scene(self.store)
-        self.position = self._read("receivers/position")
-        self.normal = self._read("receivers/normal")
-        self.object = self._read("receivers/object")
-        self.side = self._read("receivers/side")
-        self.vertex = self._read("receivers/vertex") if "receivers/vertex" in self.store else None
+        read: Any = self.store.read
+        self.position: NDArray[np.float64] = read("receivers/position")
+        self.normal: NDArray[np.float32] = read("receivers/normal")
+        self.object: NDArray[np.int32] = read("receivers/object")
+        self.side: NDArray[np.int8] = read("receivers/side")
+        self.vertex: NDArray[np.int32] | None = read("receivers/vertex") if "receivers/vertex" in self.store else None
         self.resolution = int(self.store.settings["light_resolution"])
         self.basis: str = self.store.settings["basis"]
         self._bits: NDArray[np.uint8] | None = None
         layout = self.store.layouts["visibility/bits"]
         if layout.raw_bytes <= IN_MEMORY:
-            self._bits = self._read("visibility/bits")
+            self._bits = read("visibility/bits")
         self._chunk = layout.chunks[0]
-
-    def _read(self, name: str) -> NDArray[np.generic]:
-        return self.store.read(name)
 
     def __len__(self) -> int:
         return len(self.position)
@@ -87,10 +87,12 @@ class LightingStore:
     def receiver_of_vertex(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Receiver on the front and on the back of every vertex, (V,) int32 each, -1 where there is none."""
         if self.vertex is None:
-            raise StoreError(f"{self.store.path}: its receivers are pixels of camera {self.camera_name!r}, not vertices")
+            raise StoreError(
+                f"{self.store.path}: its receivers are pixels of camera {self.camera_name!r}, not vertices"
+            )
         out = []
         for side in (1, -1):
-            index = np.full(len(self.geometry.positions), -1, np.int32)
+            index: NDArray[np.int32] = np.full(len(self.geometry.positions), -1, np.int32)
             pick = np.flatnonzero(self.side == side)
             index[self.vertex[pick]] = pick
             out.append(index)
@@ -101,13 +103,10 @@ class LightingStore:
         if self._bits is not None:
             yield slice(0, len(self)), self._bits
             return
-        array = self.store.array("visibility/bits")
+        array: Any = self.store.array("visibility/bits")
         for start in range(0, len(self), self._chunk):
             rows = slice(start, min(start + self._chunk, len(self)))
-            yield rows, self._chunk_bits(array, rows)
-
-    def _chunk_bits(self, array: object, rows: slice) -> NDArray[np.uint8]:
-        return np.asarray(array[rows])  # type: ignore[index]
+            yield rows, np.asarray(array[rows])
 
     def exit_radiance(
         self,
@@ -129,10 +128,24 @@ class LightingStore:
         table = pack_materials(per_object)
         albedo = np.array([m.diffuse for m in per_object], np.float32)[material]
         e = self._irradiance(sky, active, basis or self.basis)
+        lamps = None
+        if "lights/bits" in self.store:
+            lamp_e, lamps = local_radiance(
+                self.store.read("lights/bits"),
+                pack_lights(self.scene.lights.values()),
+                self.position,
+                self.normal,
+                view,
+                material,
+                table,
+                np.ones(len(self), bool) if active is None else active,
+                self.threads,
+            )
+            e = e + lamp_e
         diffuse = e * albedo * np.float32(1.0 / np.pi)
-        through = np.array(
-            [m.transmittance if m.model == "translucent" else BLACK for m in per_object], np.float32
-        )[material]
+        through = np.array([m.transmittance if m.model == "translucent" else BLACK for m in per_object], np.float32)[
+            material
+        ]
         if through.any():
             diffuse += e[self._partner()] * through * np.float32(1.0 / np.pi)
         shiny = np.array([m.model in SHINY and m.specular != BLACK for m in per_object], bool)[material]
@@ -142,7 +155,7 @@ class LightingStore:
             raise InputError("a material with a specular lobe looks different from everywhere: a --camera is needed")
         rows = np.flatnonzero(shiny if active is None else shiny & active)
         specular = np.zeros((len(self), 3), np.float32)
-        tree = sky_tree(splat(sky), latlong_to_cube(environment, FINE_SKY, rotate) if _narrow(per_object) else sky)
+        tree = sky_tree(splat(sky), environment, rotate)
         for block, bits in self.blocks():
             pick = rows[(rows >= block.start) & (rows < block.stop)]
             if len(pick):
@@ -156,6 +169,8 @@ class LightingStore:
                     tree,
                     self.threads,
                 )
+        if lamps is not None:
+            specular += lamps * table.parameters[material][:, SPECULAR : SPECULAR + 3].astype(np.float32)
         return Radiance(diffuse, specular)
 
     def _irradiance(self, sky: SkyCube, active: NDArray[np.bool_] | None, basis: str) -> NDArray[np.float32]:
@@ -172,20 +187,26 @@ class LightingStore:
                 f"{self.store.path}: made with --basis {self.basis}, so it has no {basis} transfer; "
                 f"precompute it with --basis {basis}"
             )
-        pi = np.float32(np.pi)
+        read: Any = self.store.read
         if basis == "sh":
             order = int(self.store.settings["sh_order"])
             light = sh.project_sky(sky.flux, sky.resolution, order).astype(np.float32)
-            return np.maximum(self._read(name) @ light, 0.0) * pi
+            return self._positive(read(name) @ light)
         if basis == "haar":
             light = haar.forward(np.moveaxis(sky.radiance(), -1, 0)).reshape(3, -1).T.astype(np.float32)
-            index, value = self._read("direct/haar_index"), self._read(name)
-            return np.maximum(haar.gather(index, value, np.ascontiguousarray(light)), 0.0) * pi
+            values = haar.gather(read("direct/haar_index"), read(name), np.ascontiguousarray(light))
+            return self._positive(values)
         light = sky.radiance().reshape(-1, 3).astype(np.float32)
-        array = self.store.array(name)
+        array: Any = self.store.array(name)
         step = array.chunks[0]
         parts = [np.asarray(array[a : a + step]) @ light for a in range(0, len(self), step)]
-        return np.concatenate(parts) * pi
+        return self._positive(np.concatenate(parts))
+
+    @staticmethod
+    def _positive(values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Irradiance from the exit radiance of a white surface; what truncation put below zero is cut off."""
+        out: NDArray[np.float32] = np.maximum(values, 0.0) * np.float32(np.pi)
+        return out
 
     def _partner(self) -> NDArray[np.int64]:
         """The receiver on the other side of the same vertex, itself where there is none."""
@@ -196,10 +217,3 @@ class LightingStore:
 
 
 SHINY = ("blinn-phong", "cook-torrance", "phong")
-
-
-def _narrow(materials: list[Material]) -> bool:
-    return any(
-        (m.model == "cook-torrance" and m.roughness < 0.05) or (m.model in ("blinn-phong", "phong") and m.shininess > 500)
-        for m in materials
-    )

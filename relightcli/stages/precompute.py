@@ -17,12 +17,14 @@ from relightcli.core.shade import picture, primary
 from relightcli.core.sphere import cube, haar, sh
 from relightcli.core.transport import visibility
 from relightcli.core.transport.camera import make_film
+from relightcli.core.transport.light_visibility import POINTS_PER_LIGHT, light_bits
+from relightcli.core.transport.local_lights import pack_lights
 from relightcli.core.transport.receivers import Receivers, spatial_order, vertex_receivers
 from relightcli.errors import InputError
 from relightcli.plan import effects
 from relightcli.run import blocks as run
 from relightcli.scene.build import build_geometry, scene_to_json
-from relightcli.scene.model import Geometry, Scene
+from relightcli.scene.model import Geometry, RectangleLight, Scene, SphereLight
 from relightcli.scene.parse import load_scene
 
 KIND = "transfer"
@@ -43,6 +45,7 @@ class Config:
     receivers: str = "vertices"
     basis: str = "visibility"
     coefficients: int = 128
+    haar_tolerance: float = 0.0
     sh_order: int = 6
     bounces: int = 0
     seed: int = 0
@@ -63,8 +66,10 @@ class VisibilityJob:
     shadows: bool
     basis: str
     coefficients: int
+    haar_tolerance: float
     sh_order: int
     seed: int
+    lights: tuple[SphereLight | RectangleLight, ...]
 
     def open(self) -> VisibilityWorker:
         return VisibilityWorker(self)
@@ -79,7 +84,8 @@ class VisibilityWorker:
 
         self.position, self.normal = array("receivers/position"), array("receivers/normal")
         self.tracer = Tracer(array("mesh/position")[:], array("mesh/face")[:]) if job.shadows else None
-        self.out = {name: array(name) for name in _outputs(job.basis)}
+        self.out = {name: array(name) for name in _outputs(job)}
+        self.lights = pack_lights(job.lights)
         self.directions = cube.texel_directions(job.resolution).reshape(-1, 3).astype(np.float32)
         self.solid_angle = cube.solid_angles(job.resolution).reshape(-1).astype(np.float32)
 
@@ -102,13 +108,16 @@ class VisibilityWorker:
                 "inferred": float(traced.inferred),
                 "bits": float(3 * job.resolution**2 * len(position)),
             }
+        if self.lights.number:
+            self.out["lights/bits"][rows], rays = light_bits(self.tracer, self.lights, position, normal)
+            info["rays"] += float(rays)
         info["trace_seconds"] = time.perf_counter() - start
         self.out["visibility/bits"][rows] = bits
         if job.basis == "sh":
             self.out["direct/sh"][rows] = sh.cosine_transfer(bits, normal, job.sh_order)
         elif job.basis == "haar":
             index, value, dropped = haar.truncated_cosine_transfer(
-                bits, normal, self.directions, self.solid_angle, job.coefficients
+                bits, normal, self.directions, self.solid_angle, job.coefficients, job.haar_tolerance
             )
             self.out["direct/haar_index"][rows] = index
             self.out["direct/haar_value"][rows] = value
@@ -130,10 +139,10 @@ def _dense(
     return out
 
 
-def _outputs(basis: str) -> list[str]:
+def _outputs(job: VisibilityJob) -> list[str]:
     more = {"visibility": [], "sh": ["direct/sh"], "dense": ["direct/dense"]}
     more["haar"] = ["direct/haar_index", "direct/haar_value"]
-    return ["visibility/bits", *more[basis]]
+    return ["visibility/bits", *more[job.basis], *(["lights/bits"] if job.lights else [])]
 
 
 def precompute(config: Config) -> dict[str, Any]:
@@ -143,10 +152,9 @@ def precompute(config: Config) -> dict[str, Any]:
     asked = effects.parse_effects(config.effects)
     scene = load_scene(config.scene, allow_outside=config.allow_outside)
     effects.need_static({o.name: o.motion for o in scene.objects.values()}, asked)
-    _need_no_lights(scene)
     geometry = build_geometry(scene)
     both = _both_sides(scene, geometry)
-    plan = effects.decide(asked, geometry.positions, geometry.faces, bool(both.any()), len(scene.lights))
+    plan = effects.decide(asked, geometry.positions, geometry.faces, bool(both.any()))
     shadows = next(d.simulate for d in plan if d.effect == "shadows")
     if config.dry_run:
         return _dry_run(config, scene, geometry, both, plan, shadows)
@@ -160,7 +168,7 @@ def precompute(config: Config) -> dict[str, Any]:
         "bounces": config.bounces,
     }
     if config.basis == "haar":
-        settings["coefficients"] = config.coefficients
+        settings |= {"coefficients": config.coefficients, "haar_tolerance": config.haar_tolerance}
     if config.basis == "sh":
         settings["sh_order"] = config.sh_order
     writer = formats.begin(
@@ -185,7 +193,7 @@ def precompute(config: Config) -> dict[str, Any]:
         _put_geometry(writer, geometry)
         _put_receivers(writer, receivers)
         size = _block_size(config.light_resolution)
-        _create_outputs(writer, config, len(receivers), size)
+        _create_outputs(writer, config, len(receivers), size, len(scene.lights))
         job = VisibilityJob(
             str(writer.partial_path),
             config.light_resolution,
@@ -193,8 +201,10 @@ def precompute(config: Config) -> dict[str, Any]:
             shadows,
             config.basis,
             config.coefficients,
+            config.haar_tolerance,
             config.sh_order,
             config.seed,
+            tuple(scene.lights.values()),
         )
         run.run_blocks(
             job,
@@ -220,9 +230,9 @@ def _check(config: Config) -> None:
     if config.basis not in BASES:
         raise InputError(f"--basis: expected one of {', '.join(BASES)}; found {config.basis!r}")
     if not 1 <= config.coefficients <= 6 * resolution * resolution:
-        raise InputError(
-            f"--coefficients: expected 1 to {6 * resolution * resolution}; found {config.coefficients}"
-        )
+        raise InputError(f"--coefficients: expected 1 to {6 * resolution * resolution}; found {config.coefficients}")
+    if not 0.0 <= config.haar_tolerance < 1.0:
+        raise InputError(f"--haar-tolerance: expected 0 to 1; found {config.haar_tolerance}")
     if not 1 <= config.sh_order <= 16:
         raise InputError(f"--sh-order: expected 1 to 16; found {config.sh_order}")
     if config.bounces != 0:
@@ -232,19 +242,12 @@ def _check(config: Config) -> None:
         )
 
 
-def _need_no_lights(scene: Scene) -> None:
-    if scene.lights:
-        raise InputError(
-            f"{scene.path}: lights.{next(iter(scene.lights))}: this version does not precompute local lights; "
-            "remove it, or use relight --reference, which traces them"
-        )
-
-
 def _both_sides(scene: Scene, geometry: Geometry) -> NDArray[np.bool_]:
     """Objects whose back is lit too: two-sided ones, and membranes that let light through."""
     materials = list(scene.materials.values())
     translucent = np.array([materials[m].model == "translucent" for m in geometry.material], bool)
-    return geometry.two_sided | translucent
+    both: NDArray[np.bool_] = geometry.two_sided | translucent
+    return both
 
 
 def _inputs(scene: Scene) -> dict[str, str]:
@@ -355,8 +358,22 @@ def _block_size(resolution: int) -> int:
     return min(size, 4096)
 
 
-def _create_outputs(writer: formats.Writer, config: Config, count: int, size: int) -> None:
+def _create_outputs(writer: formats.Writer, config: Config, count: int, size: int, lights: int) -> None:
     resolution = config.light_resolution
+    if lights:
+        n = lights * POINTS_PER_LIGHT // 8
+        writer.array(
+            "lights/bits",
+            shape=(count, n),
+            dtype=np.uint8,
+            chunks=(size, n),
+            dims=("receiver", "point_byte"),
+            attrs={
+                "bit_order": "little",
+                "description": "1 where the light's point is above the horizon and unblocked",
+            },
+            codec="zstd",
+        )
     writer.array(
         "visibility/bits",
         shape=(count, 6, resolution, resolution // 8),
@@ -385,7 +402,9 @@ def _create_outputs(writer: formats.Writer, config: Config, count: int, size: in
 
 def _summary(config: Config, started: float, resumed: bool, geometry: Geometry) -> dict[str, Any]:
     store = formats.open_store(config.output, KIND)
-    total = {key: sum(b.get(key, 0.0) for b in store.blocks) for key in ("rays", "checked", "wrong", "inferred", "bits")}
+    total = {
+        key: sum(b.get(key, 0.0) for b in store.blocks) for key in ("rays", "checked", "wrong", "inferred", "bits")
+    }
     # Share of all bits above the horizon that the check predicts to be wrong; what it found was mended.
     wrong = total["wrong"] / total["checked"] * total["inferred"] / total["bits"] if total["checked"] else 0.0
     return {

@@ -364,11 +364,11 @@ def environment_behind(environment: NDArray[np.float32], rotate: float, camera: 
 
 def _towards(eye: NDArray[np.float64], position: NDArray[np.float64]) -> NDArray[np.float32]:
     d = eye - position
-    return (d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-300)).astype(np.float32)
+    unit: NDArray[np.float64] = d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-300)
+    return unit.astype(np.float32)
 
 
 def _need_finite(values: NDArray[np.float32], what: str) -> None:
     bad = ~np.isfinite(values)
     if bad.any():
         raise NumericalError(f"{what}: {int(bad.sum())} values of the result are not finite; nothing was written")
-

@@ -20,6 +20,7 @@ Before a value's first key it has that key's value, after its last key that one'
 
 from __future__ import annotations
 
+import itertools
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
@@ -118,7 +119,7 @@ def _between(track: list[tuple[float, Any]] | None, number: int) -> tuple[float,
         return None
     if number <= track[0][0]:
         return tuple(track[0][1])
-    for (a, low), (b, high) in zip(track, track[1:], strict=False):
+    for (a, low), (b, high) in itertools.pairwise(track):
         if a <= number <= b:
             t = (number - a) / (b - a)
             return tuple((1.0 - t) * x + t * y for x, y in zip(low, high, strict=True))

@@ -103,13 +103,13 @@ def test_only_the_default_scene_is_loaded(simple, tmp_path):
 
 
 def test_strips_and_fans(tmp_path):
-    square = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], "<f4")
+    ladder = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 2, 0], [1, 2, 0]], "<f4")
     b = Builder()
-    strip = {"attributes": {"POSITION": b.accessor(square)}, "mode": 5}
-    fan = {"attributes": {"POSITION": b.accessor(square[[0, 1, 3, 2]])}, "mode": 6}
+    strip = {"attributes": {"POSITION": b.accessor(ladder)}, "mode": 5}
+    fan = {"attributes": {"POSITION": b.accessor(ladder[[0, 1, 3, 2]])}, "mode": 6}
     b.node(mesh=b.mesh(strip, fan))
     found = load_mesh(b.gltf(tmp_path / "a.gltf"))
-    assert found.faces.tolist() == [[0, 1, 2], [2, 1, 3], [4, 5, 6], [4, 6, 7]]
+    assert found.faces.tolist() == [[0, 1, 2], [2, 1, 3], [2, 3, 4], [4, 3, 5], [6, 7, 8], [6, 8, 9]]
     p = found.positions[found.faces]
     assert (np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])[:, 2] == 1).all()
 

@@ -90,12 +90,24 @@ def test_the_files_normals_win_and_bad_ones_are_computed(tmp_path):
 
 def test_vertex_texture_coordinates_of_a_ply_keep_its_normals(tmp_path):
     extra = "property float nx\nproperty float ny\nproperty float nz\nproperty float u\nproperty float v\n"
-    # Listed so that sorting the texture coordinates would reorder the vertices.
-    body = "0 0 0 1 0 0 0.9 0\n1 0 0 0 1 0 0.1 0.2\n0 1 0 0 0 1 0.5 0.7\n3 0 1 2\n"
-    mesh = load(tmp_path, "a.ply", PLY.format(vertex=XYZ + extra, face=LIST, body=body))
-    assert np.array_equal(mesh.positions, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    assert np.array_equal(mesh.normals, np.eye(3))
-    assert np.allclose(mesh.uvs, [[0.9, 0], [0.1, 0.2], [0.5, 0.7]], atol=1e-7)  # float32 in the file
+    # The first vertex belongs to no face: dropping it would part the others from their normals.
+    body = "9 9 9 1 1 1 0 0\n0 0 0 1 0 0 0.9 0\n1 0 0 0 1 0 0.1 0.2\n0 1 0 0 0 1 0.5 0.7\n3 1 2 3\n"
+    text = PLY.format(vertex=XYZ + extra, face=LIST, body=body).replace("vertex 3", "vertex 4")
+    mesh = load(tmp_path, "a.ply", text)
+    assert np.array_equal(mesh.positions, [[9, 9, 9], [0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    assert np.array_equal(mesh.normals[1:], np.eye(3))
+    assert np.allclose(mesh.uvs[1:], [[0.9, 0], [0.1, 0.2], [0.5, 0.7]], atol=1e-7)  # float32 in the file
+
+
+def test_face_texture_coordinates_of_a_ply_split_its_seams(tmp_path):
+    text = "ply\nformat ascii 1.0\nelement vertex 4\n" + XYZ + "element face 2\n" + LIST
+    text += "property list uchar float texcoord\nend_header\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n"
+    mesh = load(tmp_path, "a.ply", text + "3 0 1 2 6 0 0 1 0 1 1\n3 0 2 3 6 0.5 0.5 0.25 0.25 0 1\n")
+    assert mesh.positions[mesh.faces].tolist() == [
+        [[0, 0, 0], [1, 0, 0], [1, 1, 0]],
+        [[0, 0, 0], [1, 1, 0], [0, 1, 0]],
+    ]
+    assert mesh.uvs[mesh.faces].tolist() == [[[0, 0], [1, 0], [1, 1]], [[0.5, 0.5], [0.25, 0.25], [0, 1]]]
 
 
 def test_obj_texture_coordinates_and_normals_stay_with_their_corner(tmp_path):

@@ -4,12 +4,14 @@ A program of its own: forking is safe here, where no thread has been started, an
 
     python -m tests.formats.crash_driver SCENARIO FOLDER
 
-Prints one JSON object. Scenarios: `step-fresh` and `step-overwrite` kill the job before its first, second, third, ...
-call that changes the file system, then run it to its end; `random` kills it 20 times by SIGKILL at random moments.
+Prints one JSON object. Scenarios: `fresh`, `overwrite` and `discard` kill the job at its first, second, third, ... call
+that changes the file system, then run it to its end; `random` kills it 20 times by SIGKILL at random moments.
 """
 
 from __future__ import annotations
 
+import builtins
+import io
 import json
 import os
 import random
@@ -22,9 +24,9 @@ from pathlib import Path
 from typing import Any
 
 import zarr  # noqa: F401  before the first fork, so that children need not load it
-from relight_formats import StoreError, begin, open_store, worker_array
 
-from tests.formats.jobs import array_files, run
+from relight_formats import StoreError, begin, open_store, worker_array
+from tests.formats.jobs import array_files, run, start, write
 
 CALLS = ("replace", "rename", "unlink", "mkdir", "rmdir", "write", "pwrite", "ftruncate")
 """What changes names or appends in place. Death before a sync leaves what death before the next of these leaves."""
@@ -32,20 +34,34 @@ KILLED = 137
 
 
 def die_before(call: int) -> None:
-    """Make this process die, without any clean-up, when it is about to make its `call`-th change to the file system."""
+    """Make this process die, without any clean-up, when it is about to make its `call`-th change to the file system.
+
+    Opening a file for writing counts as well: there it dies just after, with the file empty.
+    """
     left = [call]
+
+    def count() -> None:
+        left[0] -= 1
+        if left[0] < 0:
+            os._exit(KILLED)
 
     def wrap(function: Callable[..., Any]) -> Callable[..., Any]:
         def guarded(*args: Any, **kwargs: Any) -> Any:
-            left[0] -= 1
-            if left[0] < 0:
-                os._exit(KILLED)
+            count()
             return function(*args, **kwargs)
 
         return guarded
 
+    def guarded_open(file: Any, mode: str = "r", *args: Any, **kwargs: Any) -> Any:
+        opened = really_open(file, mode, *args, **kwargs)
+        if set(mode) & set("wxa+"):
+            count()
+        return opened
+
     for name in CALLS:
         setattr(os, name, wrap(getattr(os, name)))
+    really_open = io.open
+    io.open = builtins.open = guarded_open
 
 
 def in_child(work: Callable[[], object]) -> int:
@@ -73,31 +89,58 @@ def look(path: Path) -> str:
     return f"damaged: {problems}" if problems else f"factor {store.settings['factor']:g}"
 
 
-def step(folder: Path, *, overwrite: bool) -> list[dict[str, Any]]:
-    old = folder / "old"
-    assert in_child(lambda: run(old, 1.0)) == 0
+def prepare(path: Path, scenario: str) -> None:
+    """What is there before the run that dies: nothing, a finished store, or unfinished work, both of factor 1."""
+    if scenario == "overwrite":
+        run(path, 1.0)
+    elif scenario == "discard":
+        writer = start(path, 1.0)
+        assert writer is not None
+        with writer:
+            write(writer, 1.0)
+
+
+def rerun(path: Path, factor: float) -> bool:
+    """The job again, as a user would repeat it: with --overwrite only when it is refused without."""
+    try:
+        return run(path, factor)
+    except StoreError as error:
+        if "made with others" not in str(error):
+            raise
+        return run(path, factor, overwrite=True)
+
+
+def step(folder: Path, scenario: str) -> list[dict[str, Any]]:
+    """Run the job for factor 2 on what `prepare` made and die at every call in turn; then run a job to its end.
+
+    That job is of factor 2 again, except after `discard`: there factor 1, whose unfinished work was being dropped.
+    """
+    os.fsync = lambda fd: None  # the death of a process loses nothing that was written; syncing only takes time here
+    before = folder / "before"
+    before.mkdir()
+    assert in_child(lambda: prepare(before / "store.zarr", scenario)) == 0
     results = []
     for call in range(10_000):
-        path = folder / f"{call}.zarr"
-        if overwrite:
-            shutil.copytree(old, path)
+        place = folder / f"{call}"
+        shutil.copytree(before, place)
+        path = place / "store.zarr"
 
         def dying(path: Path = path, call: int = call) -> None:
             die_before(call)
-            run(path, 2.0, overwrite=overwrite)
+            run(path, 2.0, overwrite=scenario != "fresh")
 
         def again(path: Path = path) -> None:
-            seen = {"after_crash": look(path)}
-            run(path, 2.0, overwrite=overwrite and seen["after_crash"] != "factor 2")
+            seen: dict[str, Any] = {"after_crash": look(path)}
+            seen["worked"] = rerun(path, 1.0 if scenario == "discard" else 2.0)
             seen["at_end"] = look(path)
             (folder / "seen.json").write_text(json.dumps(seen))
 
         code = in_child(dying)
-        assert in_child(again) == 0, f"rerun after death before call {call}"
+        assert in_child(again) == 0, f"rerun after death at call {call}"
         seen = json.loads((folder / "seen.json").read_text())
-        beside = sorted(p.name for p in folder.iterdir() if p.name.startswith(path.name + "."))
+        beside = sorted(entry.name for entry in place.iterdir())
         results.append({"code": code, **seen, "files": array_files(path), "beside": beside})
-        shutil.rmtree(path)
+        shutil.rmtree(place)
         if code == 0:
             return results
     raise AssertionError("the job never ended")
@@ -173,7 +216,7 @@ def main() -> None:
     if scenario == "random":
         result: Any = random_kills(folder)
     else:
-        result = step(folder, overwrite=scenario == "step-overwrite")
+        result = step(folder, scenario)
     print(json.dumps(result))
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from relight_formats import Writer, begin, worker_array
 
 ROWS, COLUMNS, PER_BLOCK = 30, 40, 10

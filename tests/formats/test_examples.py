@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from relight_formats import StoreError, dequantise, open_store, unpack_bits
 
+from relight_formats import StoreError, dequantise, open_store, unpack_bits
 from tests.formats.jobs import array_files
 from tests.formats.json_schema import violations
 

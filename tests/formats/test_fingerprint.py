@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from relight_formats import canonical_json, fingerprint_file, fingerprint_json
 
 VALUES = st.recursive(

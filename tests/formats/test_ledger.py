@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
 from relight_formats.ledger import LedgerFile, read_ledger
 
 BLOCKS: list[dict[str, Any]] = [{"id": "first", "seconds": 1.5}, {"id": "second", "note": "ä\n"}, {"id": "third"}]

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
-from relight_formats import Status, StoreError, Writer, open_store
 
+from relight_formats import Status, StoreError, Writer, open_store
 from tests.formats.jobs import PER_BLOCK, start, values, write
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import signal
 import subprocess
@@ -11,10 +12,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from relight_formats import Status, StoreError, begin, open_store, progress
 from relight_formats.header import read_root, write_root
 from relight_formats.lock import Lock
-
 from tests.formats.jobs import ROWS, array_files, run, start, values, write
 
 
@@ -257,6 +258,22 @@ def test_a_forked_child_does_not_keep_the_lock(tmp_path: Path) -> None:
     finally:
         os.killpg(holder.pid, signal.SIGKILL)
         holder.communicate()
+
+
+def test_a_lock_won_on_a_file_that_was_just_removed_does_not_count(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = Lock(path)
+    really_lock = fcntl.flock
+
+    def first_lets_go(descriptor: int, operation: int) -> None:
+        monkeypatch.undo()
+        first.release()  # removes the file that the second has opened already
+        really_lock(descriptor, operation)
+
+    monkeypatch.setattr(fcntl, "flock", first_lets_go)
+    second = Lock(path)
+    with pytest.raises(StoreError, match="another process is writing"):
+        Lock(path)
+    second.release()
 
 
 def test_a_missing_folder_is_a_system_error_that_names_it(tmp_path: Path) -> None:

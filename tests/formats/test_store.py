@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from relight_formats import CONVENTIONS, ArraySize, StoreError, open_store, progress
 
+from relight_formats import CONVENTIONS, ArraySize, StoreError, open_store, progress
 from tests.formats.jobs import run, start, values, write
 
 

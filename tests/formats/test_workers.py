@@ -7,7 +7,6 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from relight_formats import open_store
-
 from tests.formats.jobs import PER_BLOCK, ROWS, array_files, run, start, write
 from tests.formats.workers import write_block
 

@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
-from relight_formats import StoreError, Writer, begin, open_store, worker_array
 
+from relight_formats import StoreError, Writer, begin, open_store, worker_array
 from tests.formats.jobs import array_files, run, start, write
 
 TYPES = ["bool", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f2", "f4", "f8", ">f4", ">i2"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from relight_formats import worker_array
-
 from tests.formats.jobs import PER_BLOCK, values
 
 

@@ -16,7 +16,8 @@ from tests.scene.test_parse import FULL, write
 
 
 def through_json(scene, geometry=None):
-    return json.loads(json.dumps(scene_to_json(scene, geometry), allow_nan=False))
+    """As a store keeps it: with sorted keys."""
+    return json.loads(json.dumps(scene_to_json(scene, geometry), allow_nan=False, sort_keys=True))
 
 
 def same(a: Scene, b: Scene) -> bool:
@@ -79,6 +80,10 @@ def test_environments_keep_both_paths_and_are_found_again(scene_folder):
     description = through_json(scene)
     entry = description["environments"]["sky"]
     assert entry == {"map": str(scene_folder / "sky.exr"), "relative": "sky.exr"}
+    other = scene_folder.parent / "other"
+    other.mkdir()
+    (other / "sky.exr").touch()
+    assert scene_from_json(description, folder=other).environments["sky"] == scene_folder / "sky.exr"
     moved = scene_folder.parent / "moved"
     scene_folder.rename(moved)
     assert scene_from_json(description).environments["sky"] == scene_folder / "sky.exr"
@@ -110,3 +115,24 @@ def test_a_damaged_description_is_the_stores_fault(scene_folder, damage):
 def test_a_description_of_another_kind():
     with pytest.raises(StoreError, match="expected an object"):
         scene_from_json([1, 2])
+
+
+def test_the_files_order_survives_sorted_keys():
+    scene = Scene(
+        path=Path("/a/scene.toml"),
+        objects={n: ObjectSpec(n, Path(f"/a/{n}.ply"), "z", np.eye(4)) for n in ("q", "b")},
+        materials={n: Material(n) for n in ("z", "a", "m")},
+        cameras={n: Camera(n, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)) for n in ("main", "close")},
+    )
+    again = scene_from_json(through_json(scene))
+    assert list(again.objects) == ["q", "b"]
+    assert list(again.materials) == ["z", "a", "m"]
+    assert list(again.cameras) == ["main", "close"]
+
+
+def test_an_order_that_does_not_fit_is_the_stores_fault():
+    scene = Scene(path=Path("/a/scene.toml"), objects={}, materials={"z": Material("z"), "a": Material("a")})
+    description = through_json(scene)
+    description["order"]["materials"] = ["z", "z"]
+    with pytest.raises(StoreError, match=r"order\.materials"):
+        scene_from_json(description)

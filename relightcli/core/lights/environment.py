@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from relightcli.core.sphere import cube
 
-
 STRIPS = 8  # meridian strips for each texel along a face's side, at least
 
 
@@ -165,7 +164,7 @@ def _meridian(sin_l, cos_l, resolution, edges, texels):  # type: ignore[no-untyp
         face = 4 if cos_l > 0 else 5
         m = abs(cos_l)
         right = sin_l if cos_l > 0 else -sin_l
-    column = min(max(int(math.floor((right / m + 1.0) * 0.5 * r)), 0), r - 1)
+    column = min(max(math.floor((right / m + 1.0) * 0.5 * r), 0), r - 1)
     for i in range(r):
         v = m * (2.0 * (i + 1) / r - 1.0)
         texels[count] = (face * r + (r - 1 - i)) * r + column
@@ -273,8 +272,8 @@ def _splat(flux, moment, resolution, padded, out):  # type: ignore[no-untyped-de
             s, t = x / z, y / z
         a = (s + 1.0) * 0.5 * resolution + 0.5  # column in the padded face, texel centres at whole numbers
         b = (t + 1.0) * 0.5 * resolution + 0.5
-        j = min(max(int(math.floor(a)), 0), resolution)
-        i = min(max(int(math.floor(b)), 0), resolution)
+        j = min(max(math.floor(a), 0), resolution)
+        i = min(max(math.floor(b), 0), resolution)
         fa, fb = a - j, b - i
         for di in range(2):
             for dj in range(2):

@@ -4,11 +4,12 @@ For a receiver with viewer v the integral of L V s(l, v) dl, s the specular lobe
 quadtree of the sky cube's texels. A cell that is empty, dark or far from the lobe is passed over; one over which the
 lobe hardly changes is taken whole, at the mean direction of its light, with the light of its visible texels; any other
 is opened, down to single texels. Lobes narrower than a texel are sampled instead: a fixed set of directions,
-distributed as the lobe, looks up a finer sky and the texel's visibility.
+distributed as the lobe, looks up the map itself and the texel's visibility.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -31,7 +32,9 @@ from relightcli.core.brdf.models import (
 )
 from relightcli.core.brdf.sampling import sample_direction
 from relightcli.core.lights.environment import SkyCube
+from relightcli.core.lights.latlong import texel_of
 from relightcli.core.sphere import cube
+from relightcli.core.sphere.lattice import r2_point
 
 TOP = 8  # side of the quadtree's largest cells, in texels
 SAMPLES = 256  # directions for lobes narrower than a texel
@@ -43,11 +46,11 @@ NEGLIGIBLE = 14.0  # exponent beyond which the lobe is below 1e-6 of its peak
 
 @dataclass(frozen=True)
 class SkyTree:
-    """The sky cube at R, R/2, R/4 and R/8 texels a side, the finest last; and a finer one for narrow lobes.
+    """The sky cube at R/8, R/4, R/2 and R texels a side; and the map it comes from, for narrow lobes.
 
     first (4,) int64: index of each level's first cell; flux (C, 3) float64; direction (C, 3) float64 unit, mean
     direction of the cell's light; reach (C,) float64: largest angle in radians between it and the cell's corners.
-    fine (6 Q Q, 3) float32 radiance of the finer cube, Q texels a side.
+    map (H, W, 3) float32 lat-long radiance, turned by `rotation` radians about +Y.
     """
 
     resolution: int
@@ -55,12 +58,12 @@ class SkyTree:
     flux: NDArray[np.float64]
     direction: NDArray[np.float64]
     reach: NDArray[np.float64]
-    fine: NDArray[np.float32]
-    fine_resolution: int
+    map: NDArray[np.float32]
+    rotation: float
 
 
-def sky_tree(sky: SkyCube, fine: SkyCube) -> SkyTree:
-    """The quadtree of a sky. `sky` is the cube that belongs to the visibility bits, `fine` a finer one."""
+def sky_tree(sky: SkyCube, radiance: NDArray[np.float32], rotate_degrees: float) -> SkyTree:
+    """The quadtree of a sky cube, and the lat-long map (H, W, 3) with its turn that the cube was made from."""
     levels = []
     for shrink in (8, 4, 2, 1):
         r = sky.resolution // shrink
@@ -77,8 +80,8 @@ def sky_tree(sky: SkyCube, fine: SkyCube) -> SkyTree:
         np.concatenate([level[0] for level in levels]),
         np.concatenate([level[1] for level in levels]),
         np.concatenate([level[2] for level in levels]),
-        np.ascontiguousarray(fine.radiance().reshape(-1, 3), np.float32),
-        fine.resolution,
+        np.ascontiguousarray(radiance, np.float32),
+        math.radians(rotate_degrees),
     )
 
 
@@ -123,17 +126,26 @@ def specular_radiance(
                 tree.flux,
                 tree.direction,
                 tree.reach,
-                tree.fine,
-                tree.fine_resolution,
+                tree.map,
+                tree.rotation,
                 out[a:b],
             )
-            for a, b in zip(cuts[:-1], cuts[1:], strict=True)
+            for a, b in itertools.pairwise(cuts)
             if b > a
         ]
         for job in jobs:
             job.result()
     colour = table.parameters[material][:, SPECULAR : SPECULAR + 3]
     return (out * colour).astype(np.float32)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _lobe_width(model, row):  # type: ignore[no-untyped-def]
+    """Angle in radians from the lobe's axis, in light directions halved for half-vector lobes, where it is 1/e."""
+    if model == COOK_TORRANCE:
+        return row[ROUGHNESS]
+    width = math.sqrt(2.0 / (row[SHININESS] + 1e-9))
+    return 0.5 * width if model == PHONG else width
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -178,11 +190,10 @@ def _integrate(  # type: ignore[no-untyped-def]
     flux,
     direction,
     reach,
-    fine,
-    fine_resolution,
+    radiance,
+    rotation,
     out,
 ):
-    texel = 2.0 / resolution  # about the angle of a texel's diagonal
     tiles = resolution // TOP
     level_of = np.empty(64, np.int64)
     row_of = np.empty(64, np.int64)
@@ -197,14 +208,8 @@ def _integrate(  # type: ignore[no-untyped-def]
         if not dot(n, v) > 0.0:
             continue
         i = rows[m]
-        if model == COOK_TORRANCE:
-            width = row[ROUGHNESS]
-        else:
-            width = math.sqrt(2.0 / (row[SHININESS] + 1e-9))
-        if model == PHONG:
-            width *= 0.5
-        if width < texel:
-            _sample_lobe(bits, i, n, v, model, row, resolution, fine, fine_resolution, out, m)
+        if _lobe_width(model, row) < 2.0 / resolution:
+            _sample_lobe(bits, i, n, v, model, row, resolution, radiance, rotation, out, m)
             continue
         red = green = blue = 0.0
         for face in range(6):
@@ -293,16 +298,14 @@ def _texel_of(x, y, z, resolution):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _sample_lobe(bits, i, n, v, model, row, resolution, fine, fine_resolution, out, m):  # type: ignore[no-untyped-def]
+def _sample_lobe(bits, i, n, v, model, row, resolution, radiance, rotation, out, m):  # type: ignore[no-untyped-def]
     black = (0.0, 0.0, 0.0)
     # A white specular colour: the sampler picks the specular lobe, whatever its colour is.
     white = row.copy()
     white[SPECULAR : SPECULAR + 3] = 1.0
     red = green = blue = 0.0
     for q in range(SAMPLES):
-        # The R2 sequence: an even cover of the square by a fixed set of points. [Roberts 2018]
-        u1 = (0.5 + 0.7548776662466927 * q) % 1.0
-        u2 = (0.5 + 0.5698402909980532 * q) % 1.0
+        u1, u2 = r2_point(q)
         l, usable = sample_direction(model, white, black, n, v, u1, u2)  # noqa: E741
         if not usable:
             continue
@@ -312,13 +315,11 @@ def _sample_lobe(bits, i, n, v, model, row, resolution, fine, fine_resolution, o
         _, s, _, density = lobes_and_density(model, row, n, l, v)
         if not density > 0.0:
             continue
-        face, r, c = _texel_of(l[0], l[1], l[2], fine_resolution)
-        t = (face * fine_resolution + r) * fine_resolution + c
+        y, x = texel_of(radiance.shape[0], radiance.shape[1], rotation, l)
         weight = s / density
-        red += weight * fine[t, 0]
-        green += weight * fine[t, 1]
-        blue += weight * fine[t, 2]
+        red += weight * radiance[y, x, 0]
+        green += weight * radiance[y, x, 1]
+        blue += weight * radiance[y, x, 2]
     out[m, 0] = red / SAMPLES
     out[m, 1] = green / SAMPLES
     out[m, 2] = blue / SAMPLES
-

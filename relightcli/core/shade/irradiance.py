@@ -7,6 +7,7 @@ each run costs two look-ups, whatever its length. No basis is involved: what is 
 
 from __future__ import annotations
 
+import itertools
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -46,7 +47,7 @@ def irradiance(
     with ThreadPoolExecutor(max(1, threads)) as pool:
         jobs = [
             pool.submit(_sum_runs, words[a:b], normals[a:b], active[a:b], prefix, out[a:b])
-            for a, b in zip(cuts[:-1], cuts[1:], strict=True)
+            for a, b in itertools.pairwise(cuts)
             if b > a
         ]
         for job in jobs:

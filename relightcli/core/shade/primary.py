@@ -183,4 +183,3 @@ def _edges(face, distance, face_object, face_normals, width, height, grid):  # t
                     out[y, x] = True
                     out[y + 1, x] = True
     return out
-

@@ -60,6 +60,7 @@ def truncated_cosine_transfer(
     directions: NDArray[np.float32],
     solid_angle: NDArray[np.float32],
     count: int,
+    tolerance: float = 0.0,
     by_area: bool = True,
 ) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float64]]:
     """The `count` strongest Haar coefficients of V(w) (n . w)+ dOmega / pi per receiver.
@@ -67,8 +68,10 @@ def truncated_cosine_transfer(
     bits (N, 6, R, R/8); normals (N, 3); directions (6 R R, 3) and solid_angle (R R,) of the texels. Coefficients are
     ranked by magnitude times the area of their support (`by_area`), which favours broad light, or by magnitude alone,
     which is the best choice in the sense of least squares. [Ng 2003, section 4.2]
-    Returns indices (N, count) into the 6 R R coefficients, ascending; values (N, count); and the share of the squared
-    norm that was dropped, (N,), in 0..1.
+    With a tolerance above 0, the weakest of them are left out as long as the relative RMS of what is dropped,
+    ||T - T^|| / ||T||, stays under it; they come back as index 0 with value 0.
+    Returns indices (N, count) into the 6 R R coefficients, strongest first; values (N, count); and the share of the
+    squared norm that was dropped, (N,), in 0..1.
     """
     resolution = bits.shape[2]
     words = np.ascontiguousarray(bits).reshape(len(bits), -1).view(np.uint64)
@@ -86,6 +89,7 @@ def truncated_cosine_transfer(
         index,
         value,
         dropped,
+        tolerance * tolerance,
     )
     return index, value, dropped
 
@@ -109,13 +113,14 @@ def _transform(face, scratch, resolution):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _truncate(words, normals, directions, solid_angle, weight, resolution, index, value, dropped):  # type: ignore[no-untyped-def]
+def _truncate(words, normals, directions, solid_angle, weight, resolution, index, value, dropped, share):  # type: ignore[no-untyped-def]
     area = resolution * resolution
     faces = np.empty((6, resolution, resolution), np.float32)
     scratch = np.empty((resolution, resolution), np.float32)
     flat = faces.reshape(-1)
     rank = np.empty(6 * area, np.float32)
     count = index.shape[1]
+    chosen = np.empty(count, np.int64)
     inv_pi = np.float32(0.3183098861837907)
     for i in range(len(words)):
         for t in range(6 * area):
@@ -141,15 +146,21 @@ def _truncate(words, normals, directions, solid_angle, weight, resolution, index
             if rank[t] > threshold:
                 ties -= 1
         k = 0
-        kept = 0.0
         for t in range(6 * area):
             if rank[t] > threshold or (rank[t] == threshold and ties > 0):
                 if rank[t] == threshold:
                     ties -= 1
-                index[i, k] = t
-                value[i, k] = flat[t]
-                kept += np.float64(flat[t]) * np.float64(flat[t])
+                chosen[k] = t
                 k += 1
+        order = np.argsort(-rank[chosen], kind="mergesort")
+        kept = 0.0
+        for k in range(count):
+            t = chosen[order[k]]
+            if kept >= (1.0 - share) * total and share > 0.0:
+                index[i, k], value[i, k] = 0, 0.0
+                continue
+            index[i, k], value[i, k] = t, flat[t]
+            kept += np.float64(flat[t]) * np.float64(flat[t])
         dropped[i] = max(0.0, 1.0 - kept / total) if total > 0.0 else 0.0
 
 

@@ -28,8 +28,7 @@ def _moment_basis(resolution: int, order: int) -> NDArray[np.float32]:
     directions = cube.texel_directions(resolution).reshape(-1, 3)
     weights = np.tile(cube.solid_angles(resolution).reshape(-1), 6)
     basis = harmonics(directions, order) * weights[:, None]
-    out: NDArray[np.float32] = (directions[:, :, None] * basis[:, None, :]).reshape(len(directions), -1)
-    return out.astype(np.float32)
+    return (directions[:, :, None] * basis[:, None, :]).reshape(len(directions), -1).astype(np.float32)
 
 
 def cosine_transfer(bits: NDArray[np.uint8], normals: NDArray[np.float32], order: int) -> NDArray[np.float32]:

@@ -24,6 +24,9 @@ from relightcli.core.brdf.models import Triple, dot
 from relightcli.core.brdf.sampling import about, luminance
 from relightcli.scene.model import RectangleLight, SphereLight
 
+# A light lying flush in a surface is not hidden by it: rays towards local lights end this share before them.
+LIGHT_CLEARANCE = 1e-4
+
 
 class LocalLights(NamedTuple):
     """Lights as kernels read them, world space, float64.

@@ -33,7 +33,7 @@ def vertex_receivers(
     vertex_object: NDArray[np.int32],
     both_sides: NDArray[np.bool_],
 ) -> Receivers:
-    """One receiver per vertex that a face uses, two where its object is lit from both sides (`both_sides`, per object)."""
+    """One receiver per vertex that a face uses, two where its object is lit from `both_sides` (bool per object)."""
     used = np.zeros(len(positions), bool)
     used[faces.reshape(-1)] = True
     front = np.flatnonzero(used)

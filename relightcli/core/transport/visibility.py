@@ -149,7 +149,7 @@ def _trace_batch(
 
     # A random sample of what was filled.
     ray_origins, ray_directions, owner, texel = _checks(
-        origins, normals, tables.directions, resolution, refine, mark, np.uint64(seed), CHECKS
+        origins, normals, tables.directions, resolution, refine, mark, np.uint64(seed % 2**64), CHECKS
     )
     blocked = tracer.occluded(ray_origins, ray_directions)
     rays += len(owner)
@@ -348,9 +348,9 @@ def _checks(origins, normals, directions, resolution, refine, mark, seed, checks
     texel = np.empty(n * checks, np.int32)
     count = 0
     for i in range(n):
-        x = (seed + np.uint64(i)) * np.uint64(0x9E3779B97F4A7C15)
+        # splitmix64, `checks` steps of the sequence for each receiver: no two share a number
+        x = (seed + np.uint64(i)) * np.uint64(checks) * np.uint64(0x9E3779B97F4A7C15)
         for _ in range(checks):
-            # splitmix64
             x += np.uint64(0x9E3779B97F4A7C15)
             z = x
             z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
