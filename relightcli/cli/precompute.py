@@ -22,6 +22,9 @@ from relightcli.cli import options
 )
 @click.option("--receivers", default="vertices", show_default=True, help="vertices, or pixels:CAMERA.")
 @click.option(
+    "--subdivide/--no-subdivide", default=True, help="Cut faces that are too large to carry shadows. Default: cut."
+)
+@click.option(
     "--basis",
     default="visibility",
     show_default=True,
@@ -29,10 +32,10 @@ from relightcli.cli import options
 )
 @click.option("--coefficients", default=128, show_default=True, help="Haar coefficients kept per receiver, at most.")
 @click.option(
-    "--haar-tolerance",
-    default=0.0,
-    show_default=True,
-    help="Keep only as many of them as leave this relative RMS of a receiver's transfer out.",
+    "--tolerance",
+    default=None,
+    type=float,
+    help="Haar: keep only as many coefficients as leave this relative RMS of a receiver's transfer out.",
 )
 @click.option("--sh-order", default=6, show_default=True, help="Bands of the spherical harmonics.")
 @click.option("--bounces", default=0, show_default=True, help="Interreflections to simulate (this version: 0).")

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from relightcli.scene.shapes import Mesh, arc_beam, join, lathe, patch, rounded, torus_knot, tube
 
 _COURT_CELLS = 148
-_COURT_EVEN = 3.2  # metres from the middle that have evenly spaced cells
-_COURT_RIM = 12  # cells beyond them on either side, each wider than the one before
+_COURT_EVEN = 4.0  # metres from the middle that have evenly spaced cells
+_COURT_RIM = 10  # cells beyond them on either side, each wider than the one before
 _COURT_HALF = 100.0  # metres from the middle to the edge, far enough to reach the horizon
 _TEXTURE = 1024
 _SAND = (0.42, 0.38, 0.31)  # albedo around the court, and of the ground in the skies, so that they meet unseen
@@ -145,7 +145,7 @@ def write_demo_scene(folder: str | Path) -> Path:
         write_atomic(folder / f"{name}.ply", _ply(mesh))
     write_atomic(folder / "court.obj", _court().encode())
     write_image(folder / "paving.png", _paving())
-    write_image(folder / "sky-noon.exr", sky_latlong(50.0, 310.0, 3.0, ground=_SAND))
+    write_image(folder / "sky-noon.exr", sky_latlong(58.0, 310.0, 3.0, ground=_SAND))
     write_image(folder / "sky-morning.exr", sky_latlong(20.0, 252.0, 3.0, ground=_SAND))
     write_image(folder / "sky-overcast.exr", sky_latlong(45.0, overcast=True, ground=_SAND))
     scene = folder / "scene.toml"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from relightcli.core.transport.camera import make_film
 from relightcli.core.transport.light_visibility import POINTS_PER_LIGHT, light_bits
 from relightcli.core.transport.local_lights import pack_lights
 from relightcli.core.transport.receivers import Receivers, spatial_order, vertex_receivers
+from relightcli.core.transport.tessellation import tessellate
 from relightcli.errors import InputError
 from relightcli.plan import effects
 from relightcli.run import blocks as run
@@ -43,9 +44,10 @@ class Config:
     refine: int = 4
     effects: str = "auto"
     receivers: str = "vertices"
+    subdivide: bool = True
     basis: str = "visibility"
     coefficients: int = 128
-    haar_tolerance: float = 0.0
+    tolerance: float | None = None
     sh_order: int = 6
     bounces: int = 0
     seed: int = 0
@@ -66,7 +68,7 @@ class VisibilityJob:
     shadows: bool
     basis: str
     coefficients: int
-    haar_tolerance: float
+    tolerance: float
     sh_order: int
     seed: int
     lights: tuple[SphereLight | RectangleLight, ...]
@@ -117,7 +119,7 @@ class VisibilityWorker:
             self.out["direct/sh"][rows] = sh.cosine_transfer(bits, normal, job.sh_order)
         elif job.basis == "haar":
             index, value, dropped = haar.truncated_cosine_transfer(
-                bits, normal, self.directions, self.solid_angle, job.coefficients, job.haar_tolerance
+                bits, normal, self.directions, self.solid_angle, job.coefficients, job.tolerance
             )
             self.out["direct/haar_index"][rows] = index
             self.out["direct/haar_value"][rows] = value
@@ -156,6 +158,9 @@ def precompute(config: Config) -> dict[str, Any]:
     both = _both_sides(scene, geometry)
     plan = effects.decide(asked, geometry.positions, geometry.faces, bool(both.any()))
     shadows = next(d.simulate for d in plan if d.effect == "shadows")
+    source = geometry
+    if shadows and config.subdivide and config.receivers == "vertices":
+        geometry = _subdivided(geometry)
     if config.dry_run:
         return _dry_run(config, scene, geometry, both, plan, shadows)
     settings = {
@@ -163,12 +168,13 @@ def precompute(config: Config) -> dict[str, Any]:
         "light_resolution": config.light_resolution,
         "refine": config.refine if shadows else 1,
         "receivers": config.receivers,
+        "subdivide": config.subdivide,
         "basis": config.basis,
         "seed": config.seed,
         "bounces": config.bounces,
     }
     if config.basis == "haar":
-        settings |= {"coefficients": config.coefficients, "haar_tolerance": config.haar_tolerance}
+        settings |= {"coefficients": config.coefficients, "tolerance": config.tolerance}
     if config.basis == "sh":
         settings["sh_order"] = config.sh_order
     writer = formats.begin(
@@ -191,6 +197,8 @@ def precompute(config: Config) -> dict[str, Any]:
             }
         )
         _put_geometry(writer, geometry)
+        if geometry is not source:
+            writer.put("source/face", source.faces, dims=("face", "corner"))
         _put_receivers(writer, receivers)
         size = _block_size(config.light_resolution)
         _create_outputs(writer, config, len(receivers), size, len(scene.lights))
@@ -201,7 +209,7 @@ def precompute(config: Config) -> dict[str, Any]:
             shadows,
             config.basis,
             config.coefficients,
-            config.haar_tolerance,
+            config.tolerance or 0.0,
             config.sh_order,
             config.seed,
             tuple(scene.lights.values()),
@@ -231,8 +239,8 @@ def _check(config: Config) -> None:
         raise InputError(f"--basis: expected one of {', '.join(BASES)}; found {config.basis!r}")
     if not 1 <= config.coefficients <= 6 * resolution * resolution:
         raise InputError(f"--coefficients: expected 1 to {6 * resolution * resolution}; found {config.coefficients}")
-    if not 0.0 <= config.haar_tolerance < 1.0:
-        raise InputError(f"--haar-tolerance: expected 0 to 1; found {config.haar_tolerance}")
+    if config.tolerance is not None and not 0.0 < config.tolerance < 1.0:
+        raise InputError(f"--tolerance: expected more than 0 and less than 1; found {config.tolerance}")
     if not 1 <= config.sh_order <= 16:
         raise InputError(f"--sh-order: expected 1 to 16; found {config.sh_order}")
     if config.bounces != 0:
@@ -240,6 +248,15 @@ def _check(config: Config) -> None:
             f"--bounces: this version simulates direct light only, expected 0; found {config.bounces} "
             "(relight --reference traces any number)"
         )
+
+
+def _subdivided(geometry: Geometry) -> Geometry:
+    finer = tessellate(geometry)
+    more = len(finer.positions) - len(geometry.positions)
+    if more == 0:
+        return geometry
+    note = f"faces too large to carry shadows were cut: {more} more vertices (--no-subdivide keeps them whole)"
+    return replace(finer, notes=(*geometry.notes, note))
 
 
 def _both_sides(scene: Scene, geometry: Geometry) -> NDArray[np.bool_]:

@@ -288,14 +288,17 @@ class _Session:
         return put_picture(config, shot, suffix, pixels, layers, metadata)
 
     def _write_ply(self, shot: Shot, radiance: NDArray[np.float32]) -> str:
-        geometry = self.lighting.geometry
+        geometry, store = self.lighting.geometry, self.lighting.store
         front, _ = self.lighting.receiver_of_vertex()
-        colours = np.zeros((len(geometry.positions), 3), np.float32)
-        lit = front >= 0
-        colours[lit] = radiance[front[lit]]
+        # The mesh as the scene has it: its vertices come first, its faces are kept where precompute has cut them.
+        faces: Any = store.read("source/face") if "source/face" in store else geometry.faces
+        count = int(faces.max()) + 1 if "source/face" in store else len(geometry.positions)
+        colours = np.zeros((count, 3), np.float32)
+        lit = front[:count] >= 0
+        colours[lit] = radiance[front[:count][lit]]
         _need_finite(colours, str(self.config.store))
         name = numbered(self.config.output, shot.number) if self.config.frames else self.config.output
-        write_ply(name, geometry.positions, geometry.faces, colours, shot.exposure)
+        write_ply(name, geometry.positions[:count], faces, colours, shot.exposure)
         return name
 
     def finish(self) -> None:

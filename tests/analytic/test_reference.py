@@ -208,6 +208,24 @@ def test_reflected_sky_is_the_quadrature(m, theta):
     assert_mean(picture, expected, relative=2e-4)
 
 
+@pytest.mark.parametrize("m", GLOSSY[:4], ids=lambda m: m.model)
+def test_interpolated_normals_shade_and_the_face_blocks(m):
+    # A flat square whose vertex normals all lean by 0.5: reflectance by the normal, nothing from below the square.
+    ground = square(20, material=m)
+    normal = np.array([math.sin(0.5), math.cos(0.5), 0.0])
+    ground.normals = np.tile(normal, (4, 1))
+    pixels = np.zeros((2, 4, 3))
+    pixels[:, [0, 3]], pixels[:, [1, 2]] = [1.0, 2.0, 3.0], [0.5, 0.2, 0.1]
+    light, weight = hemisphere(200, 200)
+    light = light[:, [1, 2, 0]]
+    radiance = np.where(light[:, 2:] < 0, [1.0, 2.0, 3.0], [0.5, 0.2, 0.1])
+    view = direction(0.6)[[1, 2, 0]]
+    f = evaluate_many(pack_materials([m]), np.array(0), np.array(m.diffuse), normal, light, view)
+    picture = render([ground], at_point(3 * view, (0, 0, 0)), pixels, spp=16384)
+    # 1e-3: the quadrature's steps at the tilted horizon, where the integrand has a kink.
+    assert_mean(picture, weight @ (f * radiance), relative=1e-3)
+
+
 @pytest.mark.parametrize("roughness", [0.02, 0.1, 0.5])
 def test_glossy_surface_under_a_one_texel_sun(roughness):
     # The sun stands in the mirror direction's neighbourhood: both techniques of the heuristic matter.

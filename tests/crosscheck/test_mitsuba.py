@@ -101,12 +101,13 @@ def register_glossy():
 
 
 def parts_of(model):
+    """A ground and two spheres, so coarse that face and interpolated normals differ by up to 11 degrees."""
     glossy = lambert((0.7, 0.4, 0.2)) if model == "lambert" else Material("m", model, (0.3, 0.2, 0.1), **GLOSSY[model])
     ground = glossy if model != "lambert" else lambert((0.6, 0.6, 0.6))
     return [
         square(6, -1.0, material=ground),
-        sphere(0.8, (-0.75, -0.2, 0), rings=24, material=glossy),
-        sphere(0.6, (0.8, -0.4, 0.5), rings=24, material=lambert((0.3, 0.6, 0.8))),
+        sphere(0.8, (-0.75, -0.2, 0), rings=8, material=glossy),
+        sphere(0.6, (0.8, -0.4, 0.5), rings=8, material=lambert((0.3, 0.6, 0.8))),
     ]
 
 

@@ -8,6 +8,7 @@ each run costs two look-ups, whatever its length. No basis is involved: what is 
 from __future__ import annotations
 
 import itertools
+import math
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -38,7 +39,7 @@ def irradiance(
     that a sun of 1e6 leaves the digits of a sky of 1e-3; texels on the horizon may add a little below zero, which is
     cut off. Receivers that are not `active` (N,) get 0.
     """
-    words = np.ascontiguousarray(bits).reshape(len(bits), -1).view(np.uint64)
+    words = np.ascontiguousarray(bits).reshape(len(bits), math.prod(bits.shape[1:])).view(np.uint64)
     out = np.empty((len(bits), 3), np.float32)
     normals = np.ascontiguousarray(normals, np.float32)
     if active is None:

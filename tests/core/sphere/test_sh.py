@@ -66,10 +66,10 @@ def test_addition_theorem():
         )
 
 
-@pytest.mark.parametrize(("resolution", "error"), [(16, 2.5e-3), (64, 2e-4)])
+@pytest.mark.parametrize(("resolution", "error"), [(16, 1.5e-3), (64, 1e-4)])
 def test_clamped_cosine(resolution, error):
     # E = sum A_l L_lm y_lm(n) with A_l = pi, 2 pi/3, pi/4, 0, -pi/24; the transfer carries another 1/pi. What remains
-    # is the horizon's staircase of texels, which falls with R^-1.5 to R^-2.
+    # is the horizon's staircase of texels: measured 7.8e-4 at 16, 4.1e-5 at 64.
     normals = np.concatenate([np.eye(3), -np.eye(3), random_directions(26, 5)]).astype(np.float32)
     found = sh.cosine_transfer(horizon_bits(normals, resolution), normals, 5)
     factor = np.repeat([1, 2 / 3, 1 / 4, 0, -1 / 24], [1, 3, 5, 7, 9])
@@ -82,5 +82,5 @@ def test_sky_of_few_bands_is_recovered():
     d = cube.texel_directions(r).reshape(-1, 3)
     light = np.random.default_rng(6).normal(size=(16, 3))
     flux = (sh.harmonics(d, 4) @ light) * np.tile(cube.solid_angles(r).reshape(-1), 6)[:, None]
-    # Midpoint rule over texels of 2/R: relative error of order (l/R)^2.
-    np.testing.assert_allclose(sh.project_sky(flux, r, 4), light, atol=6e-3)
+    # Midpoint rule over texels of 2/R, of order (l/R)^2: measured 7e-4.
+    np.testing.assert_allclose(sh.project_sky(flux, r, 4), light, atol=1.5e-3)
