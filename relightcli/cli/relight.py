@@ -38,6 +38,7 @@ from relightcli.cli import options
 @click.option("--spp", default=256, type=click.IntRange(1, 1 << 20), show_default=True, help="Samples of --reference.")
 @click.option("--bounces", default=None, type=click.IntRange(0, 64), help="Interreflections. Default: the store's.")
 @click.option("--seed", default=0, help="Seed of --reference.")
+@click.option("--dry-run", is_flag=True, help="Say what would be written; do nothing.")
 @options.workers
 @options.overwrite
 @options.report
@@ -68,6 +69,9 @@ def command(
 
 def _text(result: dict[str, Any]) -> str:
     lines = [f"note: {note}" for note in result["notes"]]
+    if result.get("dry_run"):
+        lines += [f"{f['output']}: {f['environment']} turned by {f['env_rotate']:g} degrees" for f in result["frames"]]
+        return "\n".join(lines)
     output = result["output"]
     name = output if isinstance(output, str) else f"{output[0]} .. {output[-1]}"
     if result.get("reference"):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from relightcli.scene.shapes import Mesh, arc_beam, join, lathe, patch, rounded, torus_knot, tube
 
-_COURT_CELLS = 148
+_COURT_CELLS = 144
 _COURT_EVEN = 4.0  # metres from the middle that have evenly spaced cells
 _COURT_RIM = 10  # cells beyond them on either side, each wider than the one before
 _COURT_HALF = 100.0  # metres from the middle to the edge, far enough to reach the horizon
@@ -172,10 +172,7 @@ def _arcade() -> Mesh:
         (1.7 * column, 0.002),
         (1.7 * column, 0.06),
         (1.15 * column, 0.11),
-        (column, 0.18),
-        (0.97 * column, 0.7),
-        (0.9 * column, 1.25),
-        (0.85 * column, 1.66),
+        *(((1.0 - 0.1 * t**1.5) * column, 0.18 + 1.48 * t) for t in np.linspace(0, 1, 16)),  # close enough for shadows
         (1.0 * column, 1.74),
         (1.55 * column, 1.8),
         (1.55 * column, beam_low),

@@ -127,6 +127,11 @@ class LightingStore:
         material = self.geometry.material[self.object]
         table = pack_materials(per_object)
         albedo = np.array([m.diffuse for m in per_object], np.float32)[material]
+        through = np.array([m.transmittance if m.model == "translucent" else BLACK for m in per_object], np.float32)
+        through = through[material]
+        partner = self._partner() if through.any() else None
+        if partner is not None and active is not None:
+            active = active | active[partner]  # light comes through from the other side
         e = self._irradiance(sky, active, basis or self.basis)
         lamps = None
         if "lights/bits" in self.store:
@@ -143,11 +148,8 @@ class LightingStore:
             )
             e = e + lamp_e
         diffuse = e * albedo * np.float32(1.0 / np.pi)
-        through = np.array([m.transmittance if m.model == "translucent" else BLACK for m in per_object], np.float32)[
-            material
-        ]
-        if through.any():
-            diffuse += e[self._partner()] * through * np.float32(1.0 / np.pi)
+        if partner is not None:
+            diffuse += e[partner] * through * np.float32(1.0 / np.pi)
         shiny = np.array([m.model in SHINY and m.specular != BLACK for m in per_object], bool)[material]
         if not shiny.any():
             return Radiance(diffuse, None)

@@ -50,6 +50,7 @@ class Config:
     seed: int = 0
     workers: int = 1
     overwrite: bool = False
+    dry_run: bool = False
     quiet: bool = False
 
 
@@ -65,6 +66,8 @@ def relight(config: Config) -> dict[str, Any]:
 
         return render_reference(config, shots, suffix, started)
     lighting = LightingStore(config.store, config.workers)
+    if config.dry_run:
+        return _plan(config, shots, lighting)
     session = _Session(lighting, config)
     opened = time.perf_counter() - started
     written, clocks = [], []
@@ -87,6 +90,22 @@ def relight(config: Config) -> dict[str, Any]:
         "frame_seconds": clocks,
         "notes": session.notes,
     }
+
+
+def _plan(config: Config, shots: list[Shot], lighting: LightingStore) -> dict[str, Any]:
+    """What a run would write, with everything that can be wrong looked at, and nothing done."""
+    frames = []
+    for shot in shots:
+        apply_settings(lighting.scene.materials, shot.settings)
+        frames.append(
+            {
+                "output": numbered(config.output, shot.number) if config.frames else config.output,
+                "environment": str(resolve_environment(shot.env, lighting.scene.environments)),
+                "env_rotate": shot.env_rotate,
+                "set": list(shot.settings),
+            }
+        )
+    return {"dry_run": True, "store": str(config.store), "receivers": len(lighting), "frames": frames, "notes": []}
 
 
 def _suffix(output: str) -> str:
@@ -173,6 +192,7 @@ class _Session:
         self.notes: list[str] = []
         self._views: dict[str, _View] = {}
         self._tracer: Tracer | None = None
+        self._maps: dict[str, str] = {}
         self._map: tuple[Path, NDArray[np.float32]] | None = None
         self._writer: formats.Writer | None = None
         self._radiance: list[NDArray[np.float32]] = []
@@ -199,6 +219,8 @@ class _Session:
             radiance, notes = images.read_environment_with_notes(path)
             self.notes.extend(n for n in notes if n not in self.notes)
             self._map = (path, radiance)
+            if self.config.output.endswith(".zarr"):
+                self._maps[str(path)] = formats.fingerprint_file(path)
         return self._map[1]
 
     def _light(
@@ -318,7 +340,7 @@ class _Session:
                 "set": list(config.settings),
                 "frames": None if config.frames is None else formats.fingerprint_file(config.frames),
             },
-            inputs={"store": store.fingerprint},
+            inputs={"store": store.fingerprint, **self._maps},
             program=f"relightcli {__version__}",
             overwrite=config.overwrite,
         )

@@ -1,0 +1,86 @@
+"""Which effects are simulated, and why."""
+
+import numpy as np
+import pytest
+
+from relightcli.errors import InputError
+from relightcli.plan.effects import AVAILABLE, blocks_nothing, decide, need_static, parse_effects
+from tests.core.transport.scenes import sphere_grid
+
+BALL, BALL_FACES = (x[0].astype(x[1]) for x in zip(sphere_grid(12, 24), (np.float64, np.int32), strict=True))
+SQUARE = np.array([[0, 0, 0], [0, 0, 1], [1, 0, 1], [1, 0, 0]], float)
+SQUARE_FACES = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+
+
+def test_names():
+    assert parse_effects("auto") is None
+    assert parse_effects("all") == AVAILABLE
+    assert parse_effects("direct") == ("direct",)
+    assert parse_effects("direct, shadows") == ("direct", "shadows")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("caustics", "expected auto, all or names out of direct, .*; found 'caustics'"),
+        ("", "found ''"),
+        ("direct,one-bounce", "'one-bounce' is not simulated by this version"),
+        ("shadows", "'direct' must be among them"),
+    ],
+)
+def test_names_that_are_refused(text, message):
+    with pytest.raises(InputError, match=message):
+        parse_effects(text)
+
+
+def test_moving_objects_need_effects_that_are_not_there():
+    need_static({"a": "static"}, None)
+    need_static({"a": "rigid"}, ("direct", "shadows"))
+    for motion, effect in (("rigid", "fields"), ("skinned", "pose")):
+        with pytest.raises(InputError, match=f"objects.b.motion is '{motion}'.*'{effect}'"):
+            need_static({"a": "static", "b": motion}, None)
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e6])
+@pytest.mark.parametrize("shift", [0.0, 10.0])
+def test_convex_and_flat_block_nothing(scale, shift):
+    assert blocks_nothing((BALL + shift) * scale, BALL_FACES) == "convex"
+    assert blocks_nothing((SQUARE + shift) * scale, SQUARE_FACES) == "flat"
+    half = BALL_FACES[BALL[BALL_FACES].mean(1)[:, 1] > 0]
+    assert blocks_nothing((BALL + shift) * scale, half) == "convex"  # a dome, seen from outside
+
+
+def test_what_blocks():
+    dented = BALL.copy()
+    dented[30] *= 0.9
+    two = np.concatenate([BALL, BALL + [3, 0, 0]]), np.concatenate([BALL_FACES, BALL_FACES + len(BALL)])
+    for positions, faces in (
+        (dented, BALL_FACES),
+        (BALL, BALL_FACES[:, ::-1]),  # a bowl: its inside sees itself
+        two,
+        (np.concatenate([SQUARE, SQUARE[:, [1, 0, 2]]]), np.concatenate([SQUARE_FACES, SQUARE_FACES + 4])),
+        # Two squares of one plane that look to opposite sides: nothing blocks, but it is not called flat.
+        (np.concatenate([SQUARE, SQUARE + [2, 0, 0]]), np.concatenate([SQUARE_FACES, SQUARE_FACES[:, ::-1] + 4])),
+    ):
+        assert blocks_nothing(np.asarray(positions, float), faces.astype(np.int32)) is None
+
+
+def test_nothing_to_test():
+    assert blocks_nothing(np.zeros((4, 3)), SQUARE_FACES) is None
+    assert blocks_nothing(SQUARE, np.zeros((1, 3), np.int32)) is None
+
+
+def shadows(asked, both=False, positions=BALL, faces=BALL_FACES):
+    plan = {d.effect: d for d in decide(asked, positions, faces, both)}
+    assert plan["direct"].simulate
+    return plan["shadows"]
+
+
+def test_decisions_come_with_their_evidence():
+    assert not shadows(None).simulate
+    assert "convex" in shadows(None).evidence
+    assert shadows(None, faces=BALL_FACES[:, ::-1]).simulate
+    assert shadows(None, both=True).simulate
+    assert "both sides" in shadows(None, both=True).evidence
+    assert shadows(("direct", "shadows")).simulate
+    assert not shadows(("direct",), faces=BALL_FACES[:, ::-1]).simulate
