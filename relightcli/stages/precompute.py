@@ -450,7 +450,14 @@ def _summary(config: Config, started: float, resumed: bool, geometry: Geometry) 
 
 
 def _raw_bytes(geometry: Geometry, points: Receivers) -> int:
-    arrays = [geometry.positions, geometry.normals, geometry.uvs, geometry.faces, points.position, points.normal]
+    arrays: list[NDArray[Any]] = [
+        geometry.positions,
+        geometry.normals,
+        geometry.uvs,
+        geometry.faces,
+        points.position,
+        points.normal,
+    ]
     return sum(a.nbytes for a in [*arrays, *geometry.textures.values()])
 
 
