@@ -48,9 +48,11 @@ def write_durably(path: Path, data: bytes | bytearray | memoryview, *, sync_fold
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is None:  # as a full disk gives it
+            error.filename = str(path)
         raise
     if sync_folder:
         fsync_folder(path.parent)

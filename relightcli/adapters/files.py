@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import stat
 from pathlib import Path
 
 from relightcli.errors import InputError
+
+
+def need_output(path: str | Path) -> None:
+    """Refuse an output that cannot be made, before work goes into it. Raises InputError."""
+    target = Path(os.path.realpath(path))
+    if not str(path) or not target.name:
+        raise InputError(f"--output {str(path)!r}: expected the name of a file or store to write")
+    if not target.parent.is_dir():
+        found = "is a file" if target.parent.exists() else "does not exist; create it first"
+        raise InputError(f"--output {path}: expected a folder to write into, but {target.parent} {found}")
 
 
 def write_atomic(path: str | Path, data: bytes) -> None:
@@ -20,16 +31,19 @@ def write_atomic(path: str | Path, data: bytes) -> None:
         raise InputError(f"{path}: is a folder; expected the name of a file to write.")
     if not target.parent.is_dir():
         raise InputError(f"{path}: the folder {target.parent} does not exist; create it first.")
-    if target.exists() and not stat.S_ISREG(target.stat().st_mode):
-        target.write_bytes(data)
-        return
     temporary = target.with_name(f".{target.name}.{os.getpid()}.partial")
     try:
+        if target.exists() and not stat.S_ISREG(target.stat().st_mode):
+            target.write_bytes(data)
+            return
         with open(temporary, "wb") as stream:
             stream.write(data)
             stream.flush()
             os.fsync(stream.fileno())
         os.replace(temporary, target)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is None:  # as a full disk gives it
+            error.filename = str(path)
         raise

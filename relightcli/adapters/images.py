@@ -10,6 +10,7 @@ Rules, stated once:
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -135,9 +136,13 @@ def _read(path: Path) -> _Raw:
         raise InputError(f"{path}: no such file; expected a picture.")
     if not path.is_file():
         raise InputError(f"{path}: is not a regular file; expected a picture.")
+    try:  # OpenImageIO takes names as UTF-8, whatever the locale
+        name = os.fsencode(path).decode("utf-8")
+    except UnicodeDecodeError:
+        raise InputError(f"{str(path)!r}: its name is not UTF-8; rename it.") from None
     wish = oiio.ImageSpec()
     wish.attribute("oiio:UnassociatedAlpha", 1)
-    source = oiio.ImageInput.open(str(path), wish)
+    source = oiio.ImageInput.open(name, wish)
     if source is None:
         raise InputError(f"{path}: cannot be read as a picture ({first_line(oiio.geterror())}).")
     try:

@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from relightcli.errors import InputError
+from relightcli.scene.fields import describe, is_number
 
 MOST_FRAMES = 100_000
 STEPPED = ("env", "camera")
@@ -134,7 +135,7 @@ def _load(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: no such file; expected a file of keyframes for --frames") from None
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder; expected a file of keyframes for --frames") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not a TOML file: {error}") from None
 
 
@@ -146,12 +147,12 @@ def _known(path: Path, where: str, table: dict[str, Any], names: set[str]) -> No
 
 
 def _number(path: Path, where: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < float("inf"):
-        raise InputError(f"{path}: {where}: expected a finite number; found {value!r}")
+    if not is_number(value):
+        raise InputError(f"{path}: {where}: expected a finite number; found {describe(value)}")
     return float(value)
 
 
 def _integer(path: Path, where: str, value: Any, low: int, high: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-        raise InputError(f"{path}: {where}: expected a whole number from {low} to {high}; found {value!r}")
+        raise InputError(f"{path}: {where}: expected a whole number from {low} to {high}; found {describe(value)}")
     return value

@@ -1,0 +1,110 @@
+"""What precompute knows before any ray: the receivers, and how they and the scene are laid down in the store."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+import relight_formats as formats
+from relightcli.adapters.rays import Tracer
+from relightcli.core.shade import picture, primary
+from relightcli.core.transport.camera import make_film
+from relightcli.core.transport.receivers import Receivers, spatial_order, vertex_receivers
+from relightcli.errors import InputError
+from relightcli.scene.model import Geometry, Scene
+
+PIXEL_GRIDS = (1, 3)  # samples along a pixel's side, inside and at edges, for pixel receivers
+
+
+@dataclass(frozen=True)
+class PixelReceivers:
+    """Receivers at what a camera sees, with the picture they belong to; `texture` (N, 3) is the texture's colour."""
+
+    points: Receivers
+    pixel: NDArray[np.int32]
+    weight: NDArray[np.float32]
+    view: NDArray[np.float32]
+    texture: NDArray[np.float32]
+    coverage: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def make_receivers(asked: str, scene: Scene, geometry: Geometry, both: NDArray[np.bool_]) -> Receivers | PixelReceivers:
+    """The receivers that `--receivers` asks for. `both` (O,): objects lit from both sides. Raises InputError."""
+    if asked == "vertices":
+        return vertex_receivers(geometry.positions, geometry.normals, geometry.faces, geometry.vertex_object, both)
+    kind, _, name = asked.partition(":")
+    if kind != "pixels" or not name:
+        raise InputError(f"--receivers: expected vertices or pixels:CAMERA; found {asked!r}")
+    if name not in scene.cameras:
+        known = ", ".join(scene.cameras) or "none"
+        raise InputError(f"--receivers: {scene.path} has no camera {name!r}; it has: {known}")
+    if (both & ~geometry.two_sided).any():
+        raise InputError(
+            "--receivers pixels: translucent materials need light from the side that the camera does not see; "
+            "use --receivers vertices"
+        )
+    return _pixel_receivers(scene, name, geometry)
+
+
+def _pixel_receivers(scene: Scene, name: str, geometry: Geometry) -> PixelReceivers:
+    film = make_film(scene.cameras[name])
+    tracer = Tracer(geometry.positions, geometry.faces)
+    normals = primary.face_normals(geometry.positions, geometry.faces)
+    samples = primary.see(tracer, film, geometry.face_object, normals, *PIXEL_GRIDS)
+    seen = picture.lit_surface(geometry, samples)
+    order = spatial_order(seen.position)
+    sample = seen.path[order]
+    position, normal = seen.position[order], seen.shading[order].astype(np.float32)
+    face = samples.face[sample]
+    facing = np.einsum("nx,nx->n", normals[face], samples.direction[sample]) < 0
+    points = Receivers(
+        position,
+        normal,
+        geometry.face_object[face].astype(np.int32),
+        np.full(len(sample), -1, np.int32),
+        np.where(facing, 1, -1).astype(np.int8),
+    )
+    return PixelReceivers(
+        points,
+        samples.pixel[sample],
+        samples.weight[sample],
+        seen.viewer[order].astype(np.float32),
+        seen.albedo[order].astype(np.float32),
+        samples.coverage,
+    )
+
+
+def put_geometry(writer: formats.Writer, geometry: Geometry) -> None:
+    put = writer.put
+    put("mesh/position", geometry.positions, dims=("vertex", "axis"), units="m")
+    put("mesh/normal", geometry.normals, dims=("vertex", "axis"))
+    put("mesh/uv", geometry.uvs, dims=("vertex", "coordinate"))
+    put("mesh/face", geometry.faces, dims=("face", "corner"))
+    put("mesh/vertex_object", geometry.vertex_object, dims=("vertex",))
+    put("mesh/face_object", geometry.face_object, dims=("face",))
+    put("objects/material", geometry.material, dims=("object",))
+    put("objects/two_sided", geometry.two_sided, dims=("object",))
+    for material, texture in geometry.textures.items():
+        put(f"textures/{material}/radiance", texture, dims=("row", "column", "colour"))
+
+
+def put_receivers(writer: formats.Writer, receivers: Receivers | PixelReceivers) -> None:
+    points = receivers.points if isinstance(receivers, PixelReceivers) else receivers
+    put = writer.put
+    put("receivers/position", points.position, dims=("receiver", "axis"), units="m")
+    put("receivers/normal", points.normal, dims=("receiver", "axis"))
+    put("receivers/object", points.object, dims=("receiver",))
+    put("receivers/side", points.side, dims=("receiver",))
+    if isinstance(receivers, PixelReceivers):
+        put("receivers/pixel", receivers.pixel, dims=("receiver",))
+        put("receivers/weight", receivers.weight, dims=("receiver",))
+        put("receivers/view", receivers.view, dims=("receiver", "axis"))
+        put("receivers/texture", receivers.texture, dims=("receiver", "colour"))
+        put("picture/coverage", receivers.coverage, dims=("row", "column"))
+    else:
+        put("receivers/vertex", points.vertex, dims=("receiver",))

@@ -1,0 +1,162 @@
+"""The work of precompute on one block of receivers: trace their visibility, project it on the chosen basis."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import relight_formats as formats
+from relightcli.adapters.rays import Tracer
+from relightcli.core.sphere import cube, haar, sh
+from relightcli.core.transport import visibility
+from relightcli.core.transport.light_visibility import POINTS_PER_LIGHT, light_bits
+from relightcli.core.transport.local_lights import pack_lights
+from relightcli.run import blocks as run
+from relightcli.scene.model import RectangleLight, SphereLight
+
+CHUNK_BYTES = 4_000_000
+
+
+@dataclass(frozen=True)
+class VisibilityJob:
+    """One block: trace the visibility of a range of receivers, and project it on the chosen basis."""
+
+    partial: str
+    resolution: int
+    refine: int
+    shadows: bool
+    basis: str
+    coefficients: int
+    tolerance: float
+    sh_order: int
+    seed: int
+    lights: tuple[SphereLight | RectangleLight, ...]
+
+    def open(self) -> VisibilityWorker:
+        return VisibilityWorker(self)
+
+
+class VisibilityWorker:
+    def __init__(self, job: VisibilityJob) -> None:
+        self.job = job
+
+        def array(name: str) -> Any:
+            return formats.worker_array(job.partial, name)
+
+        self.position, self.normal = array("receivers/position"), array("receivers/normal")
+        self.tracer = Tracer(array("mesh/position")[:], array("mesh/face")[:]) if job.shadows else None
+        self.out = {name: array(name) for name in _outputs(job)}
+        self.lights = pack_lights(job.lights)
+        self.directions = cube.texel_directions(job.resolution).reshape(-1, 3).astype(np.float32)
+        self.solid_angle = cube.solid_angles(job.resolution).reshape(-1).astype(np.float32)
+
+    def run(self, block: run.Block) -> run.Info:
+        job, rows = self.job, slice(block.start, block.stop)
+        position, normal = self.position[rows], self.normal[rows]
+        info: run.Info = {"rays": 0.0, "checked": 0.0, "wrong": 0.0, "inferred": 0.0, "bits": 0.0}
+        start = time.perf_counter()
+        if self.tracer is None:
+            bits = visibility.horizon_bits(normal, job.resolution)
+        else:
+            traced = visibility.trace_visibility(
+                self.tracer, position, normal, job.resolution, job.refine, job.seed + block.start
+            )
+            bits = traced.bits
+            info |= {
+                "rays": float(traced.rays),
+                "checked": float(traced.checked),
+                "wrong": float(traced.wrong),
+                "inferred": float(traced.inferred),
+                "bits": float(3 * job.resolution**2 * len(position)),
+            }
+        if self.lights.number:
+            self.out["lights/bits"][rows], rays = light_bits(self.tracer, self.lights, position, normal)
+            info["rays"] += float(rays)
+        info["trace_seconds"] = time.perf_counter() - start
+        self.out["visibility/bits"][rows] = bits
+        if job.basis == "sh":
+            self.out["direct/sh"][rows] = sh.cosine_transfer(bits, normal, job.sh_order)
+        elif job.basis == "haar":
+            index, value, dropped = haar.truncated_cosine_transfer(
+                bits, normal, self.directions, self.solid_angle, job.coefficients, job.tolerance
+            )
+            self.out["direct/haar_index"][rows] = index
+            self.out["direct/haar_value"][rows] = value
+            info["dropped_energy"] = float(dropped.mean())
+        elif job.basis == "dense":
+            self.out["direct/dense"][rows] = _dense(bits, normal, self.directions, self.solid_angle)
+        return info
+
+
+def _dense(
+    bits: NDArray[np.uint8],
+    normal: NDArray[np.float32],
+    directions: NDArray[np.float32],
+    solid_angle: NDArray[np.float32],
+) -> NDArray[np.float32]:
+    seen = np.unpackbits(bits.reshape(len(bits), -1), axis=1, bitorder="little")
+    weights = np.tile(solid_angle, 6) / np.float32(np.pi)
+    out: NDArray[np.float32] = np.maximum(normal @ directions.T, 0.0) * weights * seen
+    return out
+
+
+def _outputs(job: VisibilityJob) -> list[str]:
+    more = {"visibility": [], "sh": ["direct/sh"], "dense": ["direct/dense"]}
+    more["haar"] = ["direct/haar_index", "direct/haar_value"]
+    return ["visibility/bits", *more[job.basis], *(["lights/bits"] if job.lights else [])]
+
+
+def block_size(resolution: int) -> int:
+    """Receivers per block: a power of two whose visibility bits fill about one chunk."""
+    per_receiver = 6 * resolution * resolution // 8
+    size = 64
+    while size * 2 * per_receiver <= CHUNK_BYTES:
+        size *= 2
+    return min(size, 4096)
+
+
+def create_outputs(writer: formats.Writer, job: VisibilityJob, count: int) -> None:
+    """The arrays that the job's blocks fill, `count` receivers long, a chunk per block (of `direct/dense` several)."""
+    resolution, size = job.resolution, block_size(job.resolution)
+    if job.lights:
+        n = len(job.lights) * POINTS_PER_LIGHT // 8
+        writer.array(
+            "lights/bits",
+            shape=(count, n),
+            dtype=np.uint8,
+            chunks=(size, n),
+            dims=("receiver", "point_byte"),
+            attrs={
+                "bit_order": "little",
+                "description": "1 where the light's point is above the horizon and unblocked",
+            },
+            codec="zstd",
+        )
+    writer.array(
+        "visibility/bits",
+        shape=(count, 6, resolution, resolution // 8),
+        dtype=np.uint8,
+        chunks=(size, 6, resolution, resolution // 8),
+        dims=("receiver", "cube_face", "texel_row", "texel_column_byte"),
+        attrs={"bit_order": "little", "description": "1 where the texel's centre is above the horizon and unblocked"},
+        codec="zstd",
+    )
+    if job.basis == "sh":
+        n = job.sh_order**2
+        writer.array("direct/sh", shape=(count, n), dtype=np.float32, chunks=(size, n), dims=("receiver", "harmonic"))
+    elif job.basis == "haar":
+        n = job.coefficients
+        for name, dtype in (("haar_index", np.int32), ("haar_value", np.float32)):
+            writer.array(
+                f"direct/{name}", shape=(count, n), dtype=dtype, chunks=(size, n), dims=("receiver", "coefficient")
+            )
+    elif job.basis == "dense":
+        n = 6 * resolution * resolution
+        rows = max(1, CHUNK_BYTES // (4 * n))
+        while size % rows:
+            rows -= 1
+        writer.array("direct/dense", shape=(count, n), dtype=np.float32, chunks=(rows, n), dims=("receiver", "texel"))
