@@ -68,7 +68,8 @@ class LedgerFile:
             if os.write(self._descriptor, line) != len(line):
                 raise OSError(28, "No space left on device", str(self.path))
             os.fsync(self._descriptor)
-        except OSError:
+        except OSError as error:
+            error.filename = str(self.path)
             os.ftruncate(self._descriptor, size)
             raise
         self.blocks.append(block)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import signal
 import sys
 from importlib import import_module
@@ -53,6 +55,7 @@ def main(arguments: list[str] | None = None) -> None:
 def run(arguments: list[str]) -> int:
     """Runs one command line and returns its exit code; prints errors to stderr, tracebacks only with -v."""
     signal.signal(signal.SIGTERM, _interrupt)
+    _occupy_closed_streams()
     verbose = any(a == "--verbose" or (a.startswith("-v") and a.strip("v") == "-") for a in arguments)
     try:
         result: Any = group.main(arguments, prog_name="relightcli", standalone_mode=False)
@@ -83,6 +86,19 @@ def run(arguments: list[str]) -> int:
         code, message = exit_code(error)
         click.echo(f"relightcli: {message}", err=True)
         return code
+
+
+def _occupy_closed_streams() -> None:
+    """Standard streams that the caller closed become ones that cannot be used, lest the next file takes their number."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is not None:
+            continue
+        with contextlib.suppress(OSError):
+            os.fstat(number)
+            continue
+        os.open(os.devnull, os.O_WRONLY if name == "stdin" else os.O_RDONLY)  # takes the lowest free number
+        if name == "stdout":
+            sys.stdout = open(number, "w", closefd=False)  # noqa: SIM115
 
 
 def _interrupt(signum: int, frame: FrameType | None) -> None:

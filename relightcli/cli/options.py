@@ -11,6 +11,7 @@ from typing import Any
 import click
 
 Command = Callable[..., Any]
+SEED = click.IntRange(0, 2**63 - 1)
 
 
 def available_cores() -> int:

@@ -39,7 +39,7 @@ from relightcli.cli import options
 )
 @click.option("--sh-order", default=6, show_default=True, help="Bands of the spherical harmonics.")
 @click.option("--bounces", default=0, show_default=True, help="Interreflections to simulate (this version: 0).")
-@click.option("--seed", default=0, show_default=True, help="Seed of the random checks.")
+@click.option("--seed", default=0, type=options.SEED, show_default=True, help="Seed of the random checks.")
 @click.option("--allow-outside", is_flag=True, help="Let the scene file use files outside its folder.")
 @click.option("--dry-run", is_flag=True, help="Print the plan and its predicted cost; do nothing.")
 @options.workers

@@ -37,7 +37,7 @@ from relightcli.cli import options
 @click.option("--reference", is_flag=True, help="Path-trace instead; STORE may also be a scene file.")
 @click.option("--spp", default=256, type=click.IntRange(1, 1 << 20), show_default=True, help="Samples of --reference.")
 @click.option("--bounces", default=None, type=click.IntRange(0, 64), help="Interreflections. Default: the store's.")
-@click.option("--seed", default=0, help="Seed of --reference.")
+@click.option("--seed", default=0, type=options.SEED, help="Seed of --reference.")
 @click.option("--dry-run", is_flag=True, help="Say what would be written; do nothing.")
 @options.workers
 @options.overwrite

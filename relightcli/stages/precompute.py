@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 import relight_formats as formats
 from relightcli import __version__
+from relightcli.adapters.files import need_output
 from relightcli.adapters.rays import Tracer
 from relightcli.core.transport import visibility
 from relightcli.core.transport.receivers import Receivers
@@ -60,6 +61,7 @@ def precompute(config: Config) -> dict[str, Any]:
     """Runs the stage; returns a summary for the user. Raises the errors of `relightcli.errors` and OSError."""
     started = time.perf_counter()
     _check(config)
+    need_output(config.output)
     asked = effects.parse_effects(config.effects)
     scene = load_scene(config.scene, allow_outside=config.allow_outside)
     effects.need_static({o.name: o.motion for o in scene.objects.values()}, asked)

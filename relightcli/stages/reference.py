@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -23,10 +23,8 @@ from relightcli.scene.model import Geometry, Scene
 from relightcli.scene.parse import load_scene
 from relightcli.scene.settings import apply_settings
 from relightcli.stages.lighting import read_scene
+from relightcli.stages.outputs import Config, numbered, put_picture, resolve_camera, resolve_environment
 from relightcli.stages.shots import Shot
-
-if TYPE_CHECKING:
-    from relightcli.stages.relight import Config
 
 LAYER_NAMES = ("direct", "one_bounce", "two_bounce", "three_bounce", "four_bounce")
 PATHS_PER_BLOCK = 8_000_000
@@ -95,8 +93,6 @@ def open_source(path: Path) -> tuple[Scene, Geometry, str]:
 
 def render_reference(config: Config, shots: list[Shot], suffix: str, started: float) -> dict[str, Any]:
     """Path-traces every shot. Samples accumulate in `OUTPUT.samples.partial` until the picture is written."""
-    from relightcli.stages.relight import put_picture, resolve_camera, resolve_environment
-
     scene, _, fingerprint = open_source(config.store)
     bounces = config.bounces if config.bounces is not None else 0
     written, rays = [], 0
@@ -106,8 +102,6 @@ def render_reference(config: Config, shots: list[Shot], suffix: str, started: fl
         apply_settings(scene.materials, shot.settings)
         name = config.output if config.output != "-" else "relight-stdout.exr"
         if config.frames is not None:
-            from relightcli.stages.relight import numbered
-
             name = numbered(name, shot.number)
         samples = Path(f"{name}.samples")
         passes, per_pass = split_samples(config.spp)

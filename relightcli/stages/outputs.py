@@ -1,0 +1,126 @@
+"""What relight is asked for, what its outputs are called, and how a picture is put down."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relightcli.adapters import images
+from relightcli.errors import InputError
+from relightcli.scene.model import Camera
+from relightcli.stages.shots import Shot
+
+PICTURES = (".exr", ".hdr", ".tif", ".tiff", ".png", ".jpg", ".jpeg")
+SUFFIXES = (*PICTURES, ".ply", ".zarr")
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that `relight` needs to know. `output` is a path, with #### in it for a sequence, or '-'."""
+
+    store: Path
+    output: str
+    env: str | None = None
+    env_rotate: float = 0.0
+    camera: str | None = None
+    settings: tuple[str, ...] = ()
+    frames: Path | None = None
+    layers: bool = False
+    background: bool = False
+    exposure: float = 0.0
+    basis: str | None = None
+    reference: bool = False
+    spp: int = 256
+    bounces: int | None = None
+    seed: int = 0
+    workers: int = 1
+    overwrite: bool = False
+    dry_run: bool = False
+    quiet: bool = False
+
+
+def output_suffix(output: str) -> str:
+    if output == "-":
+        return ".exr"
+    suffix = Path(output).suffix.lower()
+    if suffix not in SUFFIXES:
+        raise InputError(f"--output {output}: expected a name ending in {', '.join(SUFFIXES)}, or - for stdout")
+    return suffix
+
+
+def check(config: Config, suffix: str) -> None:
+    sequence = config.frames is not None
+    if sequence and suffix != ".zarr" and "#" not in Path(config.output).name:
+        raise InputError(f"--output {config.output}: a sequence needs #### in the name for the frame number")
+    if config.layers and suffix != ".exr":
+        raise InputError(f"--layers: expected an .exr output, which can hold layers; found {config.output}")
+    if config.reference and suffix not in PICTURES:
+        raise InputError(f"--reference makes pictures; expected one of {', '.join(PICTURES)}; found {config.output}")
+    if not np.isfinite(config.env_rotate) or not np.isfinite(config.exposure):
+        raise InputError("--env-rotate and --exposure: expected finite numbers")
+    if config.bounces is not None and not config.reference and config.bounces != 0:
+        raise InputError(
+            f"--bounces {config.bounces}: the store holds direct light (0 bounces); only --reference traces more"
+        )
+
+
+def numbered(pattern: str, number: int) -> str:
+    """The name of one frame: the last run of # becomes the number, zero-padded to its length."""
+    name = Path(pattern).name
+    end = name.rfind("#") + 1
+    if end == 0:
+        return pattern
+    begin = end
+    while begin > 0 and name[begin - 1] == "#":
+        begin -= 1
+    return str(Path(pattern).with_name(f"{name[:begin]}{number:0{end - begin}d}{name[end:]}"))
+
+
+def resolve_environment(env: str | None, environments: dict[str, Path]) -> Path:
+    """The map to read: a file, a name out of the scene, or the scene's only one. Raises InputError."""
+    known = ", ".join(environments) or "none"
+    if env is None:
+        if len(environments) == 1:
+            return next(iter(environments.values()))
+        raise InputError(f"--env is needed: a file, or an environment of the scene ({known})")
+    if env in environments:
+        return environments[env]
+    path = Path(env)
+    if not path.exists():
+        raise InputError(f"--env {env}: no such file, and no environment of that name in the scene ({known})")
+    return path
+
+
+def resolve_camera(name: str | None, cameras: dict[str, Camera]) -> Camera:
+    """The camera of that name, or the scene's first. Raises InputError."""
+    if name is None:
+        if not cameras:
+            raise InputError("the scene has no camera; add [cameras.main] to the scene file and precompute again")
+        return next(iter(cameras.values()))
+    if name not in cameras:
+        raise InputError(f"--camera {name}: not in the scene; it has {', '.join(cameras) or 'none'}")
+    return cameras[name]
+
+
+def put_picture(
+    config: Config,
+    shot: Shot,
+    suffix: str,
+    pixels: NDArray[np.float32],
+    layers: dict[str, NDArray[np.float32]],
+    metadata: dict[str, Any],
+) -> str:
+    """Writes one picture under its name (or to stdout); returns the name."""
+    if config.output == "-":
+        data = images.encode_image(suffix, pixels, layers=layers, metadata=metadata)
+        sys.stdout.buffer.write(data)
+        sys.stdout.buffer.flush()
+        return "-"
+    name = numbered(config.output, shot.number) if config.frames else config.output
+    images.write_image(name, pixels, layers=layers, metadata=metadata, exposure=shot.exposure)
+    return name

@@ -1,0 +1,242 @@
+"""One run of relight over one or many frames, and what consecutive frames share."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import relight_formats as formats
+from relightcli import __version__
+from relightcli.adapters import images
+from relightcli.adapters.ply import write_ply
+from relightcli.adapters.rays import Tracer
+from relightcli.core.lights.latlong import lookup_many, make_latlong
+from relightcli.core.shade import picture, primary
+from relightcli.core.transport.camera import film_directions, make_film
+from relightcli.errors import InputError, NumericalError
+from relightcli.scene.model import Camera, Material
+from relightcli.scene.settings import apply_settings
+from relightcli.stages.lighting import LightingStore, Radiance
+from relightcli.stages.outputs import (
+    PICTURES,
+    Config,
+    numbered,
+    put_picture,
+    resolve_camera,
+    resolve_environment,
+)
+from relightcli.stages.shots import Shot
+
+
+@dataclass(frozen=True)
+class _View:
+    """What depends on the camera alone."""
+
+    camera: Camera
+    matrix: picture.PixelMatrix
+    coverage: NDArray[np.float32]
+    active: NDArray[np.bool_]
+    towards: NDArray[np.float32]
+
+
+class Session:
+    """One run over one or many frames; keeps what consecutive frames share."""
+
+    def __init__(self, lighting: LightingStore, config: Config) -> None:
+        self.lighting = lighting
+        self.config = config
+        self.lighting_seconds = 0.0
+        self.notes: list[str] = []
+        self._views: dict[str, _View] = {}
+        self._tracer: Tracer | None = None
+        self._maps: dict[str, str] = {}
+        self._map: tuple[Path, NDArray[np.float32]] | None = None
+        self._writer: formats.Writer | None = None
+        self._radiance: list[NDArray[np.float32]] = []
+
+    def write(self, shot: Shot, suffix: str) -> str:
+        environment = self._environment(shot)
+        materials = apply_settings(self.lighting.scene.materials, shot.settings)
+        if suffix in PICTURES:
+            return self._write_picture(shot, suffix, environment, materials)
+        towards = None
+        if self.lighting.scene.cameras:
+            eye = np.array(resolve_camera(shot.camera, self.lighting.scene.cameras).eye)
+            towards = _towards(eye, self.lighting.position)
+        radiance = self._light(shot, environment, materials, towards, None)
+        total = radiance.diffuse if radiance.specular is None else radiance.diffuse + radiance.specular
+        if suffix == ".ply":
+            return self._write_ply(shot, total)
+        self._radiance.append(total)
+        return self.config.output
+
+    def _environment(self, shot: Shot) -> NDArray[np.float32]:
+        path = resolve_environment(shot.env, self.lighting.scene.environments)
+        if self._map is None or self._map[0] != path:
+            radiance, notes = images.read_environment_with_notes(path)
+            self.notes.extend(n for n in notes if n not in self.notes)
+            self._map = (path, radiance)
+            if self.config.output.endswith(".zarr"):
+                self._maps[str(path)] = formats.fingerprint_file(path)
+        return self._map[1]
+
+    def _light(
+        self,
+        shot: Shot,
+        environment: NDArray[np.float32],
+        materials: dict[str, Material],
+        towards: NDArray[np.float32] | None,
+        active: NDArray[np.bool_] | None,
+    ) -> Radiance:
+        clock = time.perf_counter()
+        radiance = self.lighting.exit_radiance(
+            environment, shot.env_rotate, materials, towards, active, self.config.basis
+        )
+        self.lighting_seconds += time.perf_counter() - clock
+        return radiance
+
+    def _view(self, name: str | None) -> _View:
+        lighting = self.lighting
+        if lighting.camera_name is not None:
+            if name not in (None, lighting.camera_name):
+                raise InputError(
+                    f"--camera {name}: the store's receivers are the pixels of camera {lighting.camera_name!r}; "
+                    "precompute with --receivers vertices for other views"
+                )
+            name = lighting.camera_name
+        camera = resolve_camera(name, lighting.scene.cameras)
+        if camera.name not in self._views:
+            self._views[camera.name] = self._make_view(camera)
+        return self._views[camera.name]
+
+    def _make_view(self, camera: Camera) -> _View:
+        lighting = self.lighting
+        width, height = camera.size
+        if lighting.camera_name is not None:
+            read = lighting.store.read
+            matrix = picture.sample_matrix(
+                read("receivers/pixel"), read("receivers/weight"), read("receivers/texture"), width * height
+            )
+            active = np.ones(len(lighting), bool)
+            return _View(camera, matrix, read("picture/coverage"), active, read("receivers/view"))
+        geometry = lighting.geometry
+        if self._tracer is None:
+            self._tracer = Tracer(geometry.positions, geometry.faces)
+        normals = primary.face_normals(geometry.positions, geometry.faces)
+        film = make_film(camera)
+        base = primary.TEXTURE_GRID if geometry.textures else primary.BASE_GRID
+        samples = primary.see(self._tracer, film, geometry.face_object, normals, base)
+        front, back = lighting.receiver_of_vertex()
+        matrix = picture.vertex_matrix(geometry, samples, normals, front, back, width * height)
+        towards = _towards(film.eye, lighting.position)
+        return _View(camera, matrix, samples.coverage, matrix.used(len(lighting)), towards)
+
+    def _write_picture(
+        self, shot: Shot, suffix: str, environment: NDArray[np.float32], materials: dict[str, Material]
+    ) -> str:
+        view = self._view(shot.camera)
+        width, height = view.camera.size
+        radiance = self._light(shot, environment, materials, view.towards, view.active)
+        threads = self.config.workers
+        rgb = picture.assemble(view.matrix, radiance.diffuse, radiance.specular, threads).reshape(height, width, 3)
+        _need_finite(rgb, str(self.config.store))
+        alpha = view.coverage
+        layers = {"direct": rgb} if self.config.layers else {}
+        if self.config.background:
+            behind = environment_behind(environment, shot.env_rotate, view.camera) * (1.0 - alpha[..., None])
+            if self.config.layers:
+                layers["background"] = behind
+            rgb, alpha = rgb + behind, np.ones_like(alpha)
+        pixels = np.concatenate([rgb, alpha[..., None]], axis=2)
+        return self._put_picture(shot, suffix, pixels, layers)
+
+    def _put_picture(
+        self, shot: Shot, suffix: str, pixels: NDArray[np.float32], layers: dict[str, NDArray[np.float32]]
+    ) -> str:
+        config, store = self.config, self.lighting.store
+        metadata = {
+            "relight:program": f"relightcli {__version__}",
+            "relight:store": str(config.store),
+            "relight:store_fingerprint": store.fingerprint,
+            "relight:environment": str(resolve_environment(shot.env, self.lighting.scene.environments)),
+            "relight:env_rotate": float(shot.env_rotate),
+            "relight:camera": self._view(shot.camera).camera.name,
+            "relight:set": " ".join(shot.settings),
+            "relight:bounces": int(store.settings.get("bounces", 0)),
+        }
+        return put_picture(config, shot, suffix, pixels, layers, metadata)
+
+    def _write_ply(self, shot: Shot, radiance: NDArray[np.float32]) -> str:
+        geometry, store = self.lighting.geometry, self.lighting.store
+        front, _ = self.lighting.receiver_of_vertex()
+        # The mesh as the scene has it: its vertices come first, its faces are kept where precompute has cut them.
+        faces: Any = store.read("source/face") if "source/face" in store else geometry.faces
+        count = int(faces.max()) + 1 if "source/face" in store else len(geometry.positions)
+        colours = np.zeros((count, 3), np.float32)
+        lit = front[:count] >= 0
+        colours[lit] = radiance[front[:count][lit]]
+        _need_finite(colours, str(self.config.store))
+        name = numbered(self.config.output, shot.number) if self.config.frames else self.config.output
+        write_ply(name, geometry.positions[:count], faces, colours, shot.exposure)
+        return name
+
+    def finish(self) -> None:
+        """Writes the radiance store, if that is what was asked for."""
+        if not self._radiance:
+            return
+        config, store = self.config, self.lighting.store
+        radiance = np.stack(self._radiance)
+        _need_finite(radiance, str(config.store))
+        writer = formats.begin(
+            config.output,
+            "radiance",
+            settings={
+                "env": config.env,
+                "env_rotate": config.env_rotate,
+                "camera": config.camera,
+                "set": list(config.settings),
+                "frames": None if config.frames is None else formats.fingerprint_file(config.frames),
+            },
+            inputs={"store": store.fingerprint, **self._maps},
+            program=f"relightcli {__version__}",
+            overwrite=config.overwrite,
+        )
+        if writer is None:
+            return
+        with writer:
+            writer.put("radiance", radiance, dims=("frame", "receiver", "colour"), units="W sr-1 m-2")
+            writer.put("receivers/position", self.lighting.position, dims=("receiver", "axis"), units="m")
+            writer.commit({})
+
+    def abandon(self) -> None:
+        self._radiance = []
+
+
+def environment_behind(environment: NDArray[np.float32], rotate: float, camera: Camera) -> NDArray[np.float32]:
+    """The environment through every pixel, (H, W, 3): the mean of 2 x 2 points."""
+    film = make_film(camera)
+    width, height = camera.size
+    sky = make_latlong(environment, rotate)
+    total = np.zeros((height, width, 3))
+    for dx in (0.25, 0.75):
+        for dy in (0.25, 0.75):
+            x, y = np.arange(width)[None, :] + dx, np.arange(height)[:, None] + dy
+            total += lookup_many(sky, film_directions(film, x, y))
+    return (total / 4.0).astype(np.float32)
+
+
+def _towards(eye: NDArray[np.float64], position: NDArray[np.float64]) -> NDArray[np.float32]:
+    d = eye - position
+    unit: NDArray[np.float64] = d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-300)
+    return unit.astype(np.float32)
+
+
+def _need_finite(values: NDArray[np.float32], what: str) -> None:
+    bad = ~np.isfinite(values)
+    if bad.any():
+        raise NumericalError(f"{what}: {int(bad.sum())} values of the result are not finite; nothing was written")
