@@ -1,4 +1,4 @@
-"""Imports run one way: cli -> stages -> {plan, run, scene} -> adapters -> core. Read from the source, nothing is run."""
+"""Imports run one way: cli -> stages -> {plan, run, scene} -> adapters -> core. Read from the source; nothing runs."""
 
 from __future__ import annotations
 
@@ -27,7 +27,19 @@ ALLOWED = {
 }
 
 # `core` computes: no files, processes, logging, progress, or libraries that read and trace.
-NOT_IN_CORE = {"pathlib", "os", "io", "logging", "tqdm", "click", "zarr", "trimesh", "embreex", "OpenImageIO", "tomllib"}
+NOT_IN_CORE = {
+    "pathlib",
+    "os",
+    "io",
+    "logging",
+    "tqdm",
+    "click",
+    "zarr",
+    "trimesh",
+    "embreex",
+    "OpenImageIO",
+    "tomllib",
+}
 NOT_IN_CORE |= {"subprocess", "multiprocessing", "random", "warnings", "sys", "json", "tempfile", "shutil"}
 
 

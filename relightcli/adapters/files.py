@@ -44,6 +44,6 @@ def write_atomic(path: str | Path, data: bytes) -> None:
     except BaseException as error:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.filename is None:  # as a full disk gives it
-            error.filename = str(path)
+        if isinstance(error, OSError):  # a full disk names no file, the others the temporary one
+            error.filename, error.filename2 = str(path), None
         raise

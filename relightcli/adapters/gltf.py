@@ -97,6 +97,15 @@ def read_gltf(path: Path, data: bytes) -> tuple[list[Part], tuple[str, ...]]:
     return parts, tuple(file.notes)
 
 
+def buffer_files(path: Path) -> list[Path]:
+    """The files beside a mesh file that its geometry lies in: the buffers of a glTF; none for other formats."""
+    if path.suffix.lower() not in (".gltf", ".glb"):
+        return []
+    header, _ = _split(path, path.read_bytes())
+    uris = [str(b["uri"]) for b in header.get("buffers", []) if isinstance(b, dict) and b.get("uri") is not None]
+    return [path.parent / unquote(uri) for uri in uris if not uri.startswith("data:")]
+
+
 def _split(path: Path, data: bytes) -> tuple[dict[str, Any], bytes | None]:
     """JSON header and binary chunk [4.4]."""
     binary = None

@@ -74,9 +74,9 @@ def run(arguments: list[str]) -> int:
     except click.ClickException as error:
         error.show()
         return 2
-    except BrokenPipeError:
-        # The reader of stdout has gone (head, a closed pager): nothing more to say, and nothing to flush at exit.
-        sys.stdout = open("/dev/null", "w")  # noqa: SIM115
+    except (BrokenPipeError, SystemExit):
+        # A closed pipe, which click turns into an exit; nothing else here raises one.
+        _drop_stdout()
         return 0
     except BaseException as error:
         if verbose:
@@ -89,7 +89,7 @@ def run(arguments: list[str]) -> int:
 
 
 def _occupy_closed_streams() -> None:
-    """Standard streams that the caller closed become ones that cannot be used, lest the next file takes their number."""
+    """Standard streams that the caller closed are taken up, lest the next file gets their number."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is not None:
             continue
@@ -99,6 +99,13 @@ def _occupy_closed_streams() -> None:
         os.open(os.devnull, os.O_WRONLY if name == "stdin" else os.O_RDONLY)  # takes the lowest free number
         if name == "stdout":
             sys.stdout = open(number, "w", closefd=False)  # noqa: SIM115
+
+
+def _drop_stdout() -> None:
+    """The reader of stdout has gone (head, a closed pager): what is still to be flushed at exit goes nowhere."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.close(nowhere)
 
 
 def _interrupt(signum: int, frame: FrameType | None) -> None:

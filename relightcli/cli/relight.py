@@ -38,6 +38,7 @@ from relightcli.cli import options
 @click.option("--spp", default=256, type=click.IntRange(1, 1 << 20), show_default=True, help="Samples of --reference.")
 @click.option("--bounces", default=None, type=click.IntRange(0, 64), help="Interreflections. Default: the store's.")
 @click.option("--seed", default=0, type=options.SEED, help="Seed of --reference.")
+@click.option("--allow-outside", is_flag=True, help="Let a scene file use files outside its folder.")
 @click.option("--dry-run", is_flag=True, help="Say what would be written; do nothing.")
 @options.workers
 @options.overwrite

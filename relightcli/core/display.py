@@ -37,5 +37,5 @@ def to_display(linear: NDArray[np.floating[Any]], exposure: float = 0.0) -> NDAr
 
     linear: any shape; exposure in stops. Returns uint8 of the same shape.
     """
-    scaled = np.asarray(linear, np.float64) * 2.0**exposure
+    scaled = np.asarray(linear, np.float64) * 2.0 ** min(max(exposure, -1000.0), 1000.0)  # beyond: black or white
     return np.rint(encode_srgb(scaled.astype(np.float32)) * 255).astype(np.uint8)

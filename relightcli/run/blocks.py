@@ -17,6 +17,7 @@ from collections.abc import Callable, Hashable, Iterable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from types import FrameType
 from typing import Any, Protocol
 
 from relightcli.errors import SystemFault
@@ -109,9 +110,9 @@ def _drain(pool: Executor, job: Job, todo: list[Block], finish: Callable[[Block,
             for future in done:
                 finish(futures[future], future.result())
     except BaseException:
-        pool.shutdown(wait=False, cancel_futures=True)
         for process in list((getattr(pool, "_processes", None) or {}).values()):
             process.terminate()
+        pool.shutdown(wait=True, cancel_futures=True)
         raise
     return []
 
@@ -130,7 +131,7 @@ def _pool(workers: int) -> ProcessPoolExecutor:
 def _start_worker(parent: int) -> None:
     """A worker leaves interrupts to its parent and does not outlive it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.signal(signal.SIGTERM, _leave_worker)
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -138,6 +139,14 @@ def _start_worker(parent: int) -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+def _leave_worker(signum: int, frame: FrameType | None) -> None:
+    """Ends a worker at once, in the way of its normal end: libraries' semaphores are given back."""
+    from multiprocessing import util
+
+    util._exit_function()  # type: ignore[attr-defined]
+    os._exit(1)
 
 
 _opened: tuple[Job, Worker] | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relightcli.adapters import images
+from relightcli.adapters.files import need_output
 from relightcli.errors import InputError
-from relightcli.scene.model import Camera
+from relightcli.scene.model import Camera, Scene
+from relightcli.scene.settings import apply_settings
 from relightcli.stages.shots import Shot
 
 PICTURES = (".exr", ".hdr", ".tif", ".tiff", ".png", ".jpg", ".jpeg")
@@ -40,6 +43,7 @@ class Config:
     seed: int = 0
     workers: int = 1
     overwrite: bool = False
+    allow_outside: bool = False
     dry_run: bool = False
     quiet: bool = False
 
@@ -50,6 +54,7 @@ def output_suffix(output: str) -> str:
     suffix = Path(output).suffix.lower()
     if suffix not in SUFFIXES:
         raise InputError(f"--output {output}: expected a name ending in {', '.join(SUFFIXES)}, or - for stdout")
+    need_output(output)
     return suffix
 
 
@@ -63,10 +68,31 @@ def check(config: Config, suffix: str) -> None:
         raise InputError(f"--reference makes pictures; expected one of {', '.join(PICTURES)}; found {config.output}")
     if not np.isfinite(config.env_rotate) or not np.isfinite(config.exposure):
         raise InputError("--env-rotate and --exposure: expected finite numbers")
+    for name, path in (("the store", config.store), ("--env", config.env)):
+        if path is not None and _same_file(config.output, path):
+            raise InputError(f"--output {config.output}: is {name} itself; expected another name")
     if config.bounces is not None and not config.reference and config.bounces != 0:
         raise InputError(
             f"--bounces {config.bounces}: the store holds direct light (0 bounces); only --reference traces more"
         )
+
+
+def _same_file(a: str | Path, b: str | Path) -> bool:
+    return os.path.exists(a) and os.path.exists(b) and os.path.samefile(a, b)
+
+
+def check_shots(config: Config, shots: list[Shot], scene: Scene) -> None:
+    """Look at every frame before the first is made. Raises InputError, naming the keyframe file and the frame."""
+    for shot in shots:
+        try:
+            apply_settings(scene.materials, shot.settings)
+            resolve_environment(shot.env, scene.environments)
+            if shot.camera is not None:
+                resolve_camera(shot.camera, scene.cameras)
+        except InputError as error:
+            if config.frames is None:
+                raise
+            raise InputError(f"{config.frames}: frame {shot.number}: {error}") from None
 
 
 def numbered(pattern: str, number: int) -> str:

@@ -24,7 +24,14 @@ from relightcli.run import blocks as run
 from relightcli.scene.build import build_geometry, scene_to_json
 from relightcli.scene.model import Geometry, Scene
 from relightcli.scene.parse import load_scene
-from relightcli.stages.receiver_setup import PixelReceivers, make_receivers, put_geometry, put_receivers
+from relightcli.stages.inputs import scene_inputs
+from relightcli.stages.receiver_setup import (
+    PixelReceivers,
+    check_receivers,
+    make_receivers,
+    put_geometry,
+    put_receivers,
+)
 from relightcli.stages.visibility_job import VisibilityJob, block_size, create_outputs
 
 KIND = "transfer"
@@ -67,6 +74,7 @@ def precompute(config: Config) -> dict[str, Any]:
     effects.need_static({o.name: o.motion for o in scene.objects.values()}, asked)
     geometry = build_geometry(scene)
     both = _both_sides(scene, geometry)
+    check_receivers(config.receivers, scene, geometry, both)
     plan = effects.decide(asked, geometry.positions, geometry.faces, bool(both.any()))
     shadows = next(d.simulate for d in plan if d.effect == "shadows")
     source = geometry
@@ -92,7 +100,7 @@ def precompute(config: Config) -> dict[str, Any]:
         config.output,
         KIND,
         settings=settings,
-        inputs=_inputs(scene),
+        inputs=scene_inputs(scene),
         program=f"relightcli {__version__}",
         overwrite=config.overwrite,
     )
@@ -177,19 +185,6 @@ def _both_sides(scene: Scene, geometry: Geometry) -> NDArray[np.bool_]:
     translucent = np.array([materials[m].model == "translucent" for m in geometry.material], bool)
     both: NDArray[np.bool_] = geometry.two_sided | translucent
     return both
-
-
-def _inputs(scene: Scene) -> dict[str, str]:
-    files = {scene.path} | {o.mesh for o in scene.objects.values()}
-    files |= {m.diffuse_texture for m in scene.materials.values() if m.diffuse_texture is not None}
-    return {_short(path, scene.path.parent): formats.fingerprint_file(path) for path in sorted(files)}
-
-
-def _short(path: Path, folder: Path) -> str:
-    try:
-        return path.relative_to(folder).as_posix()
-    except ValueError:
-        return str(path)
 
 
 def _summary(config: Config, started: float, resumed: bool, geometry: Geometry) -> dict[str, Any]:

@@ -33,10 +33,10 @@ class PixelReceivers:
         return len(self.points)
 
 
-def make_receivers(asked: str, scene: Scene, geometry: Geometry, both: NDArray[np.bool_]) -> Receivers | PixelReceivers:
-    """The receivers that `--receivers` asks for. `both` (O,): objects lit from both sides. Raises InputError."""
+def check_receivers(asked: str, scene: Scene, geometry: Geometry, both: NDArray[np.bool_]) -> None:
+    """Refuse what `make_receivers` cannot make. Same parameters. Raises InputError."""
     if asked == "vertices":
-        return vertex_receivers(geometry.positions, geometry.normals, geometry.faces, geometry.vertex_object, both)
+        return
     kind, _, name = asked.partition(":")
     if kind != "pixels" or not name:
         raise InputError(f"--receivers: expected vertices or pixels:CAMERA; found {asked!r}")
@@ -48,7 +48,13 @@ def make_receivers(asked: str, scene: Scene, geometry: Geometry, both: NDArray[n
             "--receivers pixels: translucent materials need light from the side that the camera does not see; "
             "use --receivers vertices"
         )
-    return _pixel_receivers(scene, name, geometry)
+
+
+def make_receivers(asked: str, scene: Scene, geometry: Geometry, both: NDArray[np.bool_]) -> Receivers | PixelReceivers:
+    """The receivers that `--receivers` asks for, once checked. `both` (O,): objects lit from both sides."""
+    if asked == "vertices":
+        return vertex_receivers(geometry.positions, geometry.normals, geometry.faces, geometry.vertex_object, both)
+    return _pixel_receivers(scene, asked.partition(":")[2], geometry)
 
 
 def _pixel_receivers(scene: Scene, name: str, geometry: Geometry) -> PixelReceivers:

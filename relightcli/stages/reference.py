@@ -22,8 +22,16 @@ from relightcli.scene.build import build_geometry
 from relightcli.scene.model import Geometry, Scene
 from relightcli.scene.parse import load_scene
 from relightcli.scene.settings import apply_settings
+from relightcli.stages.inputs import scene_inputs
 from relightcli.stages.lighting import read_scene
-from relightcli.stages.outputs import Config, numbered, put_picture, resolve_camera, resolve_environment
+from relightcli.stages.outputs import (
+    Config,
+    check_shots,
+    numbered,
+    put_picture,
+    resolve_camera,
+    resolve_environment,
+)
 from relightcli.stages.shots import Shot
 
 LAYER_NAMES = ("direct", "one_bounce", "two_bounce", "three_bounce", "four_bounce")
@@ -44,6 +52,7 @@ class ReferenceJob:
     bounces: int
     background: bool
     seed: int
+    allow_outside: bool
 
     def open(self) -> ReferenceWorker:
         return ReferenceWorker(self)
@@ -52,7 +61,7 @@ class ReferenceJob:
 class ReferenceWorker:
     def __init__(self, job: ReferenceJob) -> None:
         self.job = job
-        scene, geometry, _ = open_source(Path(job.source))
+        scene, geometry, _ = open_source(Path(job.source), job.allow_outside)
         materials = apply_settings(scene.materials, job.settings)
         self.camera = scene.cameras[job.camera]
         self.scene = shading_scene(geometry, list(materials.values()), scene.lights.values())
@@ -82,24 +91,24 @@ class ReferenceWorker:
         return {"rays": float(tile.rays)}
 
 
-def open_source(path: Path) -> tuple[Scene, Geometry, str]:
+def open_source(path: Path, allow_outside: bool = False) -> tuple[Scene, Geometry, str]:
     """Scene, geometry and fingerprint of a transfer store, or of a scene file (.toml)."""
     if path.suffix.lower() == ".toml":
-        scene = load_scene(path, allow_outside=True)
-        return scene, build_geometry(scene), formats.fingerprint_file(path)
+        scene = load_scene(path, allow_outside=allow_outside)
+        return scene, build_geometry(scene), formats.fingerprint_json(scene_inputs(scene))
     store = formats.open_store(path, "transfer")
     return *read_scene(store), store.fingerprint
 
 
 def render_reference(config: Config, shots: list[Shot], suffix: str, started: float) -> dict[str, Any]:
     """Path-traces every shot. Samples accumulate in `OUTPUT.samples.partial` until the picture is written."""
-    scene, _, fingerprint = open_source(config.store)
+    scene, _, fingerprint = open_source(config.store, config.allow_outside)
+    check_shots(config, shots, scene)
     bounces = config.bounces if config.bounces is not None else 0
     written, rays = [], 0
     for shot in shots:
         environment = resolve_environment(shot.env, scene.environments)
         camera = resolve_camera(shot.camera, scene.cameras)
-        apply_settings(scene.materials, shot.settings)
         name = config.output if config.output != "-" else "relight-stdout.exr"
         if config.frames is not None:
             name = numbered(name, shot.number)
@@ -139,6 +148,7 @@ def render_reference(config: Config, shots: list[Shot], suffix: str, started: fl
                     bounces,
                     config.background,
                     config.seed,
+                    config.allow_outside,
                 )
                 run.run_blocks(
                     job,

@@ -5,9 +5,8 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from relightcli.scene.settings import apply_settings
 from relightcli.stages.lighting import LightingStore
-from relightcli.stages.outputs import Config, check, numbered, output_suffix, resolve_environment
+from relightcli.stages.outputs import Config, check, check_shots, numbered, output_suffix, resolve_environment
 from relightcli.stages.session import Session
 from relightcli.stages.shots import Shot, read_shots
 
@@ -26,6 +25,7 @@ def relight(config: Config) -> dict[str, Any]:
 
         return render_reference(config, shots, suffix, started)
     lighting = LightingStore(config.store, config.workers)
+    check_shots(config, shots, lighting.scene)
     if config.dry_run:
         return _plan(config, shots, lighting)
     session = Session(lighting, config)
@@ -54,15 +54,13 @@ def relight(config: Config) -> dict[str, Any]:
 
 def _plan(config: Config, shots: list[Shot], lighting: LightingStore) -> dict[str, Any]:
     """What a run would write, with everything that can be wrong looked at, and nothing done."""
-    frames = []
-    for shot in shots:
-        apply_settings(lighting.scene.materials, shot.settings)
-        frames.append(
-            {
-                "output": numbered(config.output, shot.number) if config.frames else config.output,
-                "environment": str(resolve_environment(shot.env, lighting.scene.environments)),
-                "env_rotate": shot.env_rotate,
-                "set": list(shot.settings),
-            }
-        )
+    frames = [
+        {
+            "output": numbered(config.output, shot.number) if config.frames else config.output,
+            "environment": str(resolve_environment(shot.env, lighting.scene.environments)),
+            "env_rotate": shot.env_rotate,
+            "set": list(shot.settings),
+        }
+        for shot in shots
+    ]
     return {"dry_run": True, "store": str(config.store), "receivers": len(lighting), "frames": frames, "notes": []}

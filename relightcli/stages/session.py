@@ -200,6 +200,7 @@ class Session:
                 "env_rotate": config.env_rotate,
                 "camera": config.camera,
                 "set": list(config.settings),
+                "basis": config.basis,
                 "frames": None if config.frames is None else formats.fingerprint_file(config.frames),
             },
             inputs={"store": store.fingerprint, **self._maps},

@@ -109,7 +109,9 @@ def test_bowl(tmp_path, share):
     corners, triangles = sphere_grid(32, 96, math.acos(2 * share - 1), math.pi)
     bowl = Part(corners, triangles[:, ::-1], -corners, material=lambert(0.8))
     camera = Camera("main", (0, 0, 0), (0, -1, 0.2), up=(0, 0, 1), fov=60, size=(16, 16))
-    rgb, alpha = picture(make_store(write_scene(tmp_path, {"bowl": bowl}, [camera], {"sky": WHITE_SKY}), subdivide=False))
+    rgb, alpha = picture(
+        make_store(write_scene(tmp_path, {"bowl": bowl}, [camera], {"sky": WHITE_SKY}), subdivide=False)
+    )
     assert (alpha == 1).all()
     # The rim is a polygon of 96 sides (1e-3 of its area), and crosses texels at both ends of the sky that is left.
     np.testing.assert_allclose(rgb, 0.8 * (1 - share), rtol=1.2e-2)

@@ -53,14 +53,14 @@ def test_convex_and_flat_block_nothing(scale, shift):
 def test_what_blocks():
     dented = BALL.copy()
     dented[30] *= 0.9
-    two = np.concatenate([BALL, BALL + [3, 0, 0]]), np.concatenate([BALL_FACES, BALL_FACES + len(BALL)])
+    two = np.concatenate([BALL, BALL + np.array([3, 0, 0])]), np.concatenate([BALL_FACES, BALL_FACES + len(BALL)])
     for positions, faces in (
         (dented, BALL_FACES),
         (BALL, BALL_FACES[:, ::-1]),  # a bowl: its inside sees itself
         two,
         (np.concatenate([SQUARE, SQUARE[:, [1, 0, 2]]]), np.concatenate([SQUARE_FACES, SQUARE_FACES + 4])),
         # Two squares of one plane that look to opposite sides: nothing blocks, but it is not called flat.
-        (np.concatenate([SQUARE, SQUARE + [2, 0, 0]]), np.concatenate([SQUARE_FACES, SQUARE_FACES[:, ::-1] + 4])),
+        (np.concatenate([SQUARE, SQUARE + np.array([2, 0, 0])]), np.concatenate([SQUARE_FACES, SQUARE_FACES[:, ::-1] + 4])),
     ):
         assert blocks_nothing(np.asarray(positions, float), faces.astype(np.int32)) is None
 

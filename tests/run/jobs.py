@@ -91,3 +91,20 @@ class Sleeping:
         (Path(self.folder) / f"pid.{os.getpid()}").touch()
         time.sleep(60)
         return {}
+
+
+@dataclass(frozen=True)
+class FailingBesideASleeper:
+    """Block 0 takes a minute; block 1 fails as soon as block 0 has begun."""
+
+    folder: str
+
+    def open(self):
+        return self
+
+    def run(self, block):
+        if block.start == 0:
+            return Sleeping(self.folder).run(block)
+        while not list(Path(self.folder).glob("pid.*")):
+            time.sleep(0.01)
+        raise ValueError("bug")

@@ -14,7 +14,7 @@ import pytest
 from relightcli.cli.exits import SYSTEM, exit_code
 from relightcli.errors import InputError, SystemFault
 from relightcli.run.blocks import Block, close_worker, run_blocks, split
-from tests.run.jobs import Broken, Counting, Dying, FileLedger
+from tests.run.jobs import Broken, Counting, Dying, FailingBesideASleeper, FileLedger
 
 
 @pytest.fixture(autouse=True)
@@ -71,7 +71,9 @@ def test_a_worker_is_opened_once_per_process(tmp_path):
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-@pytest.mark.parametrize("error", [InputError("bad"), OSError(28, "No space left on device", "chunk"), ValueError("bug")])
+@pytest.mark.parametrize(
+    "error", [InputError("bad"), OSError(28, "No space left on device", "chunk"), ValueError("bug")]
+)
 def test_an_error_of_a_block_reaches_the_caller(tmp_path, workers, error):
     ledger = FileLedger(tmp_path)
     blocks = split("v", 5, 1)
@@ -144,6 +146,17 @@ def _alive(pid):
     state = Path(f"/proc/{pid}/stat")
     # A process that nobody has waited for yet is dead all the same.
     return not (state.exists() and state.read_text().rpartition(")")[2].split()[0] == "Z")
+
+
+def test_an_error_does_not_wait_for_the_other_workers(tmp_path):
+    # One block fails while another takes a minute: its process is ended.
+    start = time.monotonic()
+    with pytest.raises(ValueError, match="bug"):
+        run(FailingBesideASleeper(str(tmp_path)), FileLedger(tmp_path), split("v", 2, 1), 2)
+    assert time.monotonic() - start < 30
+    pids = [int(p.name[4:]) for p in tmp_path.glob("pid.*")]
+    assert len(pids) == 1
+    assert not _alive(pids[0])
 
 
 def test_interrupt_keeps_what_is_done(tmp_path):

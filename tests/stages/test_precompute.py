@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 
 import relight_formats as formats
-from relightcli.core.lights.environment import latlong_to_cube
 from relightcli.errors import InputError, StoreError
 from relightcli.run import blocks as run
 from relightcli.scene.model import Camera, Material
 from relightcli.stages import precompute as stage
+from relightcli.stages import visibility_job
 from relightcli.stages.precompute import Config, precompute
 from tests.core.transport.scenes import lambert, sphere, square
-from tests.stages.scene_files import make_store, write_scene
+from tests.stages.scene_files import make_store, picture, write_scene
 
 CAMERA = Camera("main", (0, 1.5, 3), (0, 0.3, 0), fov=40, size=(24, 16))
 ROOT = Path(__file__).parents[2]
@@ -51,7 +51,8 @@ def array_bytes(store):
 @pytest.fixture
 def small_blocks(monkeypatch):
     """Blocks of 64 receivers, so that a small scene has many."""
-    monkeypatch.setattr(stage, "_block_size", lambda resolution: 64)
+    monkeypatch.setattr(stage, "block_size", lambda resolution: 64)
+    monkeypatch.setattr(visibility_job, "block_size", lambda resolution: 64)
 
 
 @pytest.mark.parametrize("basis", ["visibility", "haar", "sh", "dense"])
@@ -74,8 +75,8 @@ class Stopping:
 
     def __init__(self, monkeypatch, after, error):
         self.left, self.error = after, error
-        self.run = stage.VisibilityWorker.run
-        monkeypatch.setattr(stage.VisibilityWorker, "run", lambda worker, block: self(worker, block))
+        self.run = visibility_job.VisibilityWorker.run
+        monkeypatch.setattr(visibility_job.VisibilityWorker, "run", lambda worker, block: self(worker, block))
 
     def __call__(self, worker, block):
         if self.left == 0:
@@ -185,7 +186,8 @@ def test_summary_agrees_with_the_store(scene, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"light_resolution": 48}, "--light-resolution: expected 16, 32, 64, 128 or 256 .* found 48"),
+        ({"light_resolution": 20}, "--light-resolution: .* found 20"),
+        ({"light_resolution": 8}, "--light-resolution: .* found 8"),
         ({"refine": 3}, "--refine: expected 1, 2, 4 or 8.* found 3"),
         ({"refine": 8}, "--refine: .*a quarter of --light-resolution; found 8"),
         ({"basis": "wavelet"}, "--basis: expected one of .* found 'wavelet'"),
@@ -210,17 +212,15 @@ def test_any_seed(scene, tmp_path):
 
 
 def test_missing_scene_and_missing_folder(scene, tmp_path):
-    with pytest.raises(InputError, match="none.toml"):
+    with pytest.raises(InputError, match=r"none\.toml"):
         precompute(config(tmp_path / "none.toml", tmp_path / "t.zarr"))
-    with pytest.raises(OSError, match="nowhere"):
+    with pytest.raises(InputError, match="nowhere does not exist"):
         precompute(config(scene, tmp_path / "nowhere" / "t.zarr"))
 
 
 def test_a_camera_that_sees_nothing(scene, tmp_path):
     away = Camera("main", (0, 1, 3), (0, 1, 9), fov=20, size=(4, 4))
     blind = write_scene(tmp_path, {"ball": sphere(0.5, rings=4)}, [away], {"sky": np.ones((2, 4, 3))})
-    from tests.stages.scene_files import picture
-
     for receivers in ("vertices", "pixels:main"):
         store = make_store(blind, f"{receivers[0]}.zarr", receivers=receivers, light_resolution=16, refine=2)
         rgb, alpha = picture(store)
@@ -232,13 +232,12 @@ def test_bases_against_visibility(scene, tmp_path):
     # All Haar coefficients and the dense transfer are one sum; SH of order 6 leaves out what lies above band 5.
     from relightcli.stages.lighting import LightingStore
 
-    sky = latlong_to_cube(np.ones((2, 4, 3), np.float32), 16)
-    assert sky.resolution == 16
-    environment = np.zeros((16, 32, 3), np.float32)
-    environment[:] = (1 + 0.5 * np.sin(np.pi * (0.5 - (np.arange(16) + 0.5) / 16)))[:, None, None]
+    latitude = np.pi * (0.5 - (np.arange(16) + 0.5) / 16)
+    environment = np.broadcast_to((1 + 0.5 * np.sin(latitude))[:, None, None], (16, 32, 3)).astype(np.float32)
     radiance = {}
     for basis, more in (("dense", {}), ("haar", {"coefficients": 1536}), ("sh", {"sh_order": 6})):
-        store = LightingStore(make_store(scene, f"{tmp_path}/{basis}.zarr", basis=basis, light_resolution=16, refine=2, **more), 1)
+        made = make_store(scene, f"{tmp_path}/{basis}.zarr", basis=basis, light_resolution=16, refine=2, **more)
+        store = LightingStore(made, 1)
         white = {name: Material(name, diffuse=(1.0, 1.0, 1.0)) for name in store.scene.materials}
         radiance[basis] = store.exit_radiance(environment, 30.0, white, None).diffuse
         radiance["visibility"] = store.exit_radiance(environment, 30.0, white, None, basis="visibility").diffuse
@@ -256,7 +255,8 @@ def test_haar_error_falls_with_the_coefficients(scene, tmp_path):
     exact, errors = None, []
     for count in (1536, 256, 64, 16):
         output = f"{tmp_path}/{count}.zarr"
-        store = LightingStore(make_store(scene, output, basis="haar", coefficients=count, light_resolution=16, refine=2), 1)
+        made = make_store(scene, output, basis="haar", coefficients=count, light_resolution=16, refine=2)
+        store = LightingStore(made, 1)
         diffuse = store.exit_radiance(environment, 0.0, store.scene.materials, None).diffuse
         exact = diffuse if exact is None else exact
         errors.append(float(np.sqrt(((diffuse - exact) ** 2).mean() / (exact**2).mean())))
@@ -284,14 +284,13 @@ def wait_for_blocks(output, process, count=1):
     while True:
         assert process.poll() is None, process.stderr.read().decode()
         assert time.monotonic() < deadline
-        if partial.exists() and len(formats.progress(output).done if False else _recorded(partial)) >= count:
+        if len(recorded(partial)) >= count:
             return
         time.sleep(0.02)
 
 
-def _recorded(partial):
-    ledger = [p for p in partial.iterdir() if p.is_file() and "ledger" in p.name]
-    return ledger[0].read_bytes().splitlines() if ledger else []
+def recorded(partial):
+    return formats.progress(partial)["blocks"] if (partial / "zarr.json").exists() else []
 
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
@@ -305,7 +304,7 @@ def test_interrupted_programs_say_so_and_resume(long_scene, tmp_path, signum):
     assert b"Traceback" not in stderr
     assert b"run the same command again" in stderr
     assert not output.exists()
-    before = len(_recorded(output.with_name("t.zarr.partial")))
+    before = len(recorded(output.with_name("t.zarr.partial")))
     assert before >= 1
     process = start(long_scene, output)
     wait_for_blocks(output, process, before)

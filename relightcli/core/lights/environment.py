@@ -3,7 +3,9 @@
 The sphere is cut into meridian strips whose borders are all pixel columns and all meridians through texel corners. In
 a strip the pixels and the texels met from pole to pole are two partitions of s = sin(latitude) in [-1, 1]; merging
 them gives the solid angle dlambda ds of every overlap. Each pixel's solid angle is thus shared out completely: total
-power is kept to rounding, for a one-pixel sun too, and a constant map stays constant to about 1e-7.
+power is kept to rounding, for a one-pixel sun too. A texel's border is taken at its latitude in the middle of the
+strip: a constant map stays constant to 4e-3 at 16, 5e-4 at 64 and 1.3e-4 at 256 texels a side in the worst texel, near
+the poles, and six to eight times better in the mean square.
 """
 
 from __future__ import annotations

@@ -63,7 +63,8 @@ def vertex_matrix(
     sample = seen.path
     face = samples.face[sample]
     corner = geometry.faces[face]
-    facing = np.einsum("nx,nx->n", face_normals[face], samples.direction[sample]) < 0
+    # The side is the one that `lit_surface` chose: a second test against the ray could round to the other one.
+    facing = np.einsum("nx,nx->n", face_normals[face], seen.geometric) > 0
     receiver = np.where(facing[:, None], front[corner], back[corner])
     u, v = samples.u[sample], samples.v[sample]
     weight = np.stack([1.0 - u - v, u, v], axis=1) * samples.weight[sample, None]

@@ -240,7 +240,9 @@ def test_a_small_sun_in_a_lobe(material, bound):
         assert found == pytest.approx(truth, rel=bound)
 
 
-@pytest.mark.xfail(strict=True, reason="256 samples of a lobe that is wider than the sun and narrower than a texel miss it")
+@pytest.mark.xfail(
+    strict=True, reason="256 samples of a lobe that is wider than the sun and narrower than a texel miss it"
+)
 @pytest.mark.parametrize("roughness", [0.01, 0.02, 0.03])
 def test_a_small_sun_in_a_narrow_lobe(roughness):
     for i in (0, 8, 16):

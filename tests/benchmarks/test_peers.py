@@ -1,0 +1,95 @@
+"""The peers that are written here, and what they are given: they must not lose because they are wrong."""
+
+import numpy as np
+
+from benchmarks import mitsuba, sky_matrix
+from benchmarks.receivers import Traceable, sample, share
+from benchmarks.scenes import BUNNY_VERTICES, Setting, write_scene
+from benchmarks.sh_transfer import ORDER, our_transfer, script_transfer
+
+# Two points that look up from far below the edge of a wall; the wall covers the half of their sky with x > 0.
+WALL = Traceable(
+    np.array([[0.01, -50, -100], [0.01, 50, -100], [0.01, 50, 100], [0.01, -50, 100.0]]) * 10,
+    np.array([[0, 1, 2], [0, 2, 3]], np.int32),
+    np.zeros((2, 3)),
+    np.array([[0, 1, 0], [0, 1, 0]], np.float32),
+)
+
+
+def test_the_script_converges_to_the_open_half_of_the_sky():
+    # Half of a clamped cosine: (1/pi) integral of cos y_0 over the half dome = y_0 / 2, y_0 = 1 / sqrt(4 pi).
+    _, transfer = script_transfer(WALL, 1 << 15, 1)
+    y0 = 1 / np.sqrt(4 * np.pi)
+    # Standard error: sqrt(E[f^2] - E[f]^2) / sqrt(n) with f = 4 cos V y_0: 4 y_0 sqrt(1/12 - 1/64) / 181 = 0.0016.
+    np.testing.assert_allclose(transfer[:, 0], y0 / 2, atol=5 * 0.0016)
+    # y_3 = sqrt(3 / 4 pi) x: (1/pi) integral of y x over the quarter y > 0, x < 0 is -2 / (3 pi). Its f is at most as
+    # large as that of y_0 times sqrt(3).
+    np.testing.assert_allclose(transfer[:, 3], -np.sqrt(3 / (4 * np.pi)) * 2 / (3 * np.pi), atol=5 * 0.0028)
+
+
+def test_the_script_and_ours_agree(monkeypatch):
+    monkeypatch.setattr("benchmarks.sh_transfer.meet", lambda: None)
+    _, expected = script_transfer(WALL, 1 << 15, 2)
+    _, rays, parts = our_transfer(0, 1, WALL, 64, 1)
+    assert rays > 0
+    ours = np.concatenate([values for _, values in parts])
+    assert ours.shape == expected.shape == (2, ORDER**2)
+    # Five standard errors of the script, each at most 4 max|y| sqrt(1/12) / sqrt(2^15), |y| <= 1.1 for l <= 2.
+    np.testing.assert_allclose(ours, expected, atol=5 * 0.007)
+
+
+def test_patches():
+    counts, alpha = sky_matrix.patch_rows()
+    assert 1 + counts.sum() == sky_matrix.PATCHES == len(sky_matrix.overcast())
+    assert len(counts) == 29
+    # The middle of every patch, by rows from the horizon up, from north over east; and the ground.
+    expected = 1
+    for row, n in enumerate(counts):
+        altitude, azimuth = (row + 0.5) * alpha, 2 * np.pi * np.arange(n) / n
+        if n == 1:
+            altitude = np.pi / 2
+        flat = np.cos(altitude)
+        d = np.stack([flat * np.sin(azimuth), np.full(n, np.sin(altitude)), -flat * np.cos(azimuth)], axis=1)
+        np.testing.assert_array_equal(sky_matrix.patch_of(d), expected + np.arange(n))
+        expected += n
+    assert sky_matrix.patch_of(np.array([[0.6, -0.8, 0.0]])) == 0
+
+
+def test_a_sensor_under_an_open_sky(monkeypatch):
+    monkeypatch.setattr("benchmarks.sky_matrix.meet", lambda: None)
+    below = Traceable(WALL.mesh - [0, 2e4, 0], WALL.faces, WALL.position, WALL.normal)
+    _, _, parts = sky_matrix.our_matrix(0, 1, below, 32, 1)
+    # E = integral of (1 + 2 sin a) / 3 cos over the dome = 7 pi / 9; rows of 3 degrees and texels of 3 degrees: 1e-3.
+    np.testing.assert_allclose(np.concatenate([e for _, e in parts]), 7 * np.pi / 9, rtol=1e-3)
+
+
+def test_map_for_bilinear_look_up():
+    sky = np.arange(24, dtype=np.float32).reshape(2, 4, 3)
+    rows = mitsuba.bilinear_map(sky)
+    assert rows.shape == (5, 8, 3)
+    np.testing.assert_array_equal(rows[0], rows[1])
+    np.testing.assert_array_equal(rows[1, ::2], sky[0])
+    np.testing.assert_array_equal(rows[2, 1::2], 0.5 * (sky[0] + sky[1]))
+    np.testing.assert_array_equal(rows[4, ::2], sky[1])
+
+
+def test_time_at_an_error():
+    found = {"error_at_one": 0.4, "seconds_fixed": 0.1, "seconds_per_sample": 0.01}
+    assert mitsuba.seconds_at(found, 0.02) == 0.1 + 400 * 0.01
+    assert mitsuba.seconds_at(found, 10.0) == 0.1 + 0.01  # no less than one sample
+
+
+def test_samples_and_shares_cover():
+    assert len(sample(100, 1000)) == 100
+    rows = sample(10_000, 640)
+    assert len(rows) == 640
+    assert rows[-1] == 9_999
+    parts = [part for rank in range(3) for part in share(5000, rank, 3)]
+    assert sorted(i for part in parts for i in range(part.start, part.stop)) == list(range(5000))
+
+
+def test_the_knot_has_as_many_vertices_as_the_bunny(tmp_path, monkeypatch):
+    monkeypatch.setenv("RELIGHT_SHARED_DATA", str(tmp_path / "absent"))
+    scene, subject = write_scene(Setting(tmp_path, False))
+    assert f"{BUNNY_VERTICES:,} vertices" in subject
+    assert (scene.parent / "knot.ply").exists()

@@ -1,0 +1,32 @@
+import shutil
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+
+def test_ci_image_diff_passes_and_catches_a_changed_material(make, tmp_path):
+    done = make("ci-image-diff", OUT=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    unchanged, _, changed = done.stdout.partition("now with another red")
+    assert "passed" in unchanged
+    assert "FAILED" not in unchanged
+    assert "FAILED" in changed
+    assert (tmp_path / "report.html").is_file()
+
+
+def test_many_skies_makes_one_more_picture_for_one_more_map_and_fails_beyond_its_limit(make, tmp_path):
+    done = make("many-skies", OUT=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "\npassed\n" in done.stdout
+    first = {f.name: f.stat().st_mtime_ns for f in (tmp_path / "pictures").iterdir()}
+    assert sorted(first) == ["sun-15.exr", "sun-35.exr", "sun-60.exr"]
+    shutil.copy(tmp_path / "maps" / "sun-35.exr", tmp_path / "maps" / "again.exr")
+    more = make("many-skies", OUT=tmp_path)
+    assert more.returncode == 0, more.stdout + more.stderr
+    second = {f.name: f.stat().st_mtime_ns for f in (tmp_path / "pictures").iterdir()}
+    assert second.pop("again.exr")
+    assert second == first
+    strict = make("many-skies", OUT=tmp_path, LIMIT=0)
+    assert strict.returncode != 0
+    assert "failed: 4 of 4" in strict.stdout
