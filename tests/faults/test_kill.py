@@ -121,10 +121,12 @@ def test_interrupted_while_workers_start(folder):
 def test_two_writers(undisturbed, folder):
     first = harness.start(folder, *harness.PRECOMPUTE, "-o", "t.zarr", *harness.WORKERS)
     harness.wait_for_blocks(first, folder / "t.zarr", 1)
+    os.killpg(first.pid, signal.SIGSTOP)  # lest it be done before the others have started
     for more in ((), ("--overwrite",)):
         code, stderr = harness.run(folder, *harness.PRECOMPUTE, "-o", "t.zarr", *more)
         assert code == 3
         assert f"another process is writing this store (process {first.pid}" in stderr
+    os.killpg(first.pid, signal.SIGCONT)
     code, stderr = harness.finish(first)
     assert code == 0, stderr
     assert harness.content(folder / "t.zarr") == harness.content(undisturbed)

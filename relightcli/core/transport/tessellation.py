@@ -23,7 +23,7 @@ from relightcli.scene.model import Geometry
 OBJECT_PARTS = 32.0
 NEAR_PARTS = 48.0
 SLOPE = 0.1
-MOST_NEW_VERTICES = 150_000
+MOST_NEW_VERTICES = 40_000
 MOST_ROUNDS = 40
 
 
@@ -66,14 +66,19 @@ class _Limit:
             others = np.arange(len(diagonals)) != k
             self.floor[others] = np.minimum(self.floor[others], self.nearest[k])
 
-    def __call__(self, middle: NDArray[np.float64], owner: NDArray[np.int32]) -> NDArray[np.float64]:
-        limit = self.widest[owner]
+    def exceeded(
+        self, middle: NDArray[np.float64], length: NDArray[np.float64], owner: NDArray[np.int32]
+    ) -> NDArray[np.bool_]:
+        """Whether edges of this length (M,), middle (M, 3) and object (M,) are longer than h."""
+        out: NDArray[np.bool_] = length > self.widest[owner]
         for k, tree in enumerate(self.trees):
-            others = owner != k
-            if others.any():
-                near = np.maximum(self.nearest[k], SLOPE * tree.query(middle[others])[0])
-                limit[others] = np.minimum(limit[others], near)
-        return limit
+            # The box around an object is nearer than the object: most edges need no search.
+            outside = np.maximum(np.maximum(tree.mins - middle, middle - tree.maxes), 0.0)
+            least = np.maximum(self.nearest[k], SLOPE * np.linalg.norm(outside, axis=1))
+            ask = np.flatnonzero(~out & (owner != k) & (length > least))
+            if len(ask):
+                out[ask] = length[ask] > np.maximum(self.nearest[k], SLOPE * tree.query(middle[ask])[0])
+        return out
 
 
 def _refine(geometry: Geometry, limit: _Limit) -> Geometry:
@@ -89,6 +94,7 @@ def _cut(geometry: Geometry, limit: _Limit, widen: float) -> Geometry | None:
     vertex_object = geometry.vertex_object
     faces, owner = geometry.faces.astype(np.int64), geometry.face_object
     settled: list[tuple[NDArray[np.int64], NDArray[np.int32]]] = []
+    short = np.zeros(0, np.int64)  # edges found short enough
     for _ in range(MOST_ROUNDS):
         ends = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2)  # (F, 3, 2)
         side = np.linalg.norm(positions[ends[..., 0]] - positions[ends[..., 1]], axis=2)
@@ -97,13 +103,16 @@ def _cut(geometry: Geometry, limit: _Limit, widen: float) -> Geometry | None:
         settled.append((faces[~open_faces], owner[~open_faces]))
         faces, owner, ends = faces[open_faces], owner[open_faces], ends[open_faces]
         key = np.sort(ends.reshape(-1, 2), axis=1)
-        edges, inverse = np.unique(key[:, 0] * len(positions) + key[:, 1], return_inverse=True)
-        a, b = edges // len(positions), edges % len(positions)
+        edges, inverse = np.unique(key[:, 0] << 32 | key[:, 1], return_inverse=True)
+        a, b = edges >> 32, edges & 0xFFFFFFFF
         middle = 0.5 * (positions[a] + positions[b])
         length = np.linalg.norm(positions[a] - positions[b], axis=1)
-        marked = length > widen * limit(middle, vertex_object[a])
+        fresh = np.flatnonzero(~np.isin(edges, short, assume_unique=True))
+        marked = np.zeros(len(edges), bool)
+        marked[fresh] = limit.exceeded(middle[fresh], length[fresh] / widen, vertex_object[a[fresh]])
         if not marked.any():
             break
+        short = np.concatenate([short, edges[fresh][~marked[fresh]]])
         of_face = inverse.reshape(-1, 3)
         longest = np.argmax(length[of_face], axis=1)
         top = of_face[np.arange(len(faces)), longest]

@@ -1,0 +1,99 @@
+"""Pictures are there whole or not at all; the reference's samples survive being killed."""
+
+from __future__ import annotations
+
+import random
+import time
+
+import pytest
+
+from tests.faults import harness
+
+FRAMES = 'format = 1\nframes = 40\n[[key]]\nframe = 1\nenv_rotate = 0\n[[key]]\nframe = 41\nenv_rotate = 360\n'
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pattern", ["turn.##.exr", "turn.##.png", "turn.##.ply"])
+def test_killed_while_writing_a_sequence(finished, pattern):
+    """Whatever stands under a frame's name is the old file or the whole new one."""
+    (finished / "frames.toml").write_text(FRAMES)
+    arguments = ("relight", "t.zarr", "--frames", "frames.toml", "-o", pattern)
+    started = time.monotonic()
+    assert harness.run(finished, *arguments)[0] == 0
+    whole = time.monotonic() - started
+    names = [pattern.replace("##", f"{k:02d}") for k in range(1, 41)]
+    expected = {name: (finished / name).read_bytes() for name in names}
+    random_ = random.Random(3)
+    found = []
+    for round_ in range(5):
+        for name in names:
+            (finished / name).write_bytes(b"old") if round_ % 2 else (finished / name).unlink()
+        process = harness.start(finished, *arguments)
+        time.sleep(random_.uniform(0.4, 1.0) * whole)
+        harness.kill_group(process)
+        for name in names:
+            data = (finished / name).read_bytes() if (finished / name).exists() else None
+            assert data == expected[name] or data == (b"old" if round_ % 2 else None), name
+            (finished / name).write_bytes(b"old")
+            found.append(data == expected[name])
+    assert any(found)  # else every kill came before the first frame
+
+
+def test_two_relights_at_once(finished):
+    """To one name: either picture, whole. To two: both."""
+    first = harness.start(finished, "relight", "t.zarr", "-o", "same.exr", "--env-rotate", 0)
+    second = harness.start(finished, "relight", "t.zarr", "-o", "same.exr", "--env-rotate", 90)
+    other = harness.start(finished, "relight", "t.zarr", "-o", "other.exr", "--env-rotate", 0)
+    assert [harness.finish(p)[0] for p in (first, second, other)] == [0, 0, 0]
+    assert harness.run(finished, "relight", "t.zarr", "-o", "turned.exr", "--env-rotate", 90)[0] == 0
+    same = (finished / "same.exr").read_bytes()
+    assert same in ((finished / "other.exr").read_bytes(), (finished / "turned.exr").read_bytes())
+
+
+# 16 rows of 400 pixels at 2,500 samples are 2 blocks of 8 million paths.
+WIDE = '[cameras.wide]\neye = [0, 1.5, 4]\ntarget = [0, 0.5, 0]\nfov = 5\nsize = [400, 16]\n'
+REFERENCE = ("relight", "scene.toml", "--reference", "--camera", "wide", "--spp", 2500, "--workers", 1)
+
+
+@pytest.mark.slow
+def test_reference_goes_on_where_it_was_killed(folder):
+    with open(folder / "scene.toml", "a") as file:
+        file.write(WIDE)
+    assert harness.run(folder, *REFERENCE, "-o", "whole.exr")[0] == 0
+    for _ in range(3):
+        process = harness.start(folder, *REFERENCE, "-o", "killed.exr")
+        wait_for_samples(process, folder / "killed.exr.samples")
+        harness.kill_group(process)
+        assert not (folder / "killed.exr").exists()
+    # Another number of samples is another picture.
+    code, stderr = harness.run(folder, *REFERENCE, "-o", "killed.exr", "--seed", 1)
+    assert code == 3
+    assert "setting seed: 0 there, 1 asked for" in stderr
+    code, stderr = harness.run(folder, *REFERENCE, "-o", "killed.exr")
+    assert code == 0, stderr
+    assert (folder / "killed.exr").read_bytes() == (folder / "whole.exr").read_bytes()
+    assert [p.name for p in folder.iterdir() if "samples" in p.name] == []
+
+
+@pytest.mark.slow
+def test_reference_refuses_samples_of_another_mesh(folder):
+    with open(folder / "scene.toml", "a") as file:
+        file.write(WIDE)
+    process = harness.start(folder, *REFERENCE, "-o", "out.exr")
+    wait_for_samples(process, folder / "out.exr.samples")
+    harness.kill_group(process)
+    with open(folder / "ball.obj", "a") as file:
+        file.write("# changed\n")
+    code, stderr = harness.run(folder, *REFERENCE, "-o", "out.exr")
+    assert code == 3
+    assert "input scene" in stderr
+
+
+def wait_for_samples(process, store):
+    """Until the first block is done, or, where an earlier run did it, a moment into the second."""
+    if harness.blocks_done(store):
+        while process.poll() is None and not list(store.parent.glob("*.lock")):
+            time.sleep(0.01)
+        time.sleep(0.5)
+        return
+    harness.wait_for_blocks(process, store, 1)
