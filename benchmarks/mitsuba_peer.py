@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 BATCH = {"quick": 8, "full": 64}  # samples a pixel of one call; larger ones do not run faster
-LONG = {"quick": 4, "full": 8}  # calls that make up each long run
+LONG = {"quick": 4, "full": 4}  # calls that make up each long run
 REPEATS = 3
 
 

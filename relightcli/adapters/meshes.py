@@ -9,6 +9,9 @@ from __future__ import annotations
 import bz2
 import io
 import re
+import signal
+import sys
+import threading
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,6 +47,24 @@ class LoadedMesh:
     notes: tuple[str, ...] = ()
 
 
+def _import_trimesh() -> None:
+    """trimesh swallows whatever its optional imports raise, an interrupt too: interrupts wait until it has loaded."""
+    if "trimesh" in sys.modules or threading.current_thread() is not threading.main_thread():
+        return
+    caught: list[int] = []
+    handlers = {
+        number: signal.signal(number, lambda signum, frame: caught.append(signum))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        import trimesh  # noqa: F401
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    for signum in caught:
+        signal.raise_signal(signum)
+
+
 def load_mesh(path: Path) -> LoadedMesh:
     """Load a mesh file; several objects in it become one mesh, in the file's order.
 
@@ -53,6 +74,7 @@ def load_mesh(path: Path) -> LoadedMesh:
     Raises InputError, naming the file, for whatever cannot be loaded as triangles with finite coordinates.
     """
     data, suffix = _read(path)
+    _import_trimesh()
     notes: list[str] = []
     try:
         # Infinities that arise here are found and refused by `_finish`.

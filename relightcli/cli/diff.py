@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING
 
 import click
 
+from relightcli.cli import options
+
 if TYPE_CHECKING:
     from relightcli.stages.diff_result import DiffResult
 
 
 @click.command("diff")
-@click.argument("a", type=click.Path(path_type=Path))
-@click.argument("b", type=click.Path(path_type=Path))
+@click.argument("a", type=options.PATH)
+@click.argument("b", type=options.PATH)
 @click.option(
     "--metric",
     "metrics",
@@ -34,8 +36,8 @@ if TYPE_CHECKING:
     metavar="P",
     help="Fail only if more than P percent of the pixels are, each by itself, beyond the threshold.",
 )
-@click.option("--heatmap", type=click.Path(path_type=Path), help="Write the first metric per pixel as a picture.")
-@click.option("--report", type=click.Path(path_type=Path), help="Write one self-contained HTML page.")
+@click.option("--heatmap", type=options.PATH, help="Write the first metric per pixel as a picture.")
+@click.option("--report", type=options.PATH, help="Write one self-contained HTML page.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout, and nothing else.")
 @click.pass_context
 def command(

@@ -12,7 +12,7 @@ from relightcli.cli.exits import BAD_STORE, OK
 
 
 @click.command(name="inspect")
-@click.argument("store", type=click.Path(path_type=Path))
+@click.argument("store", type=options.PATH)
 @click.option("--verify", is_flag=True, help="Read every chunk and check it; exit 3 if anything is wrong.")
 @options.report
 def command(store: Path, verify: bool, as_json: bool, quiet: bool, verbose: bool) -> int:

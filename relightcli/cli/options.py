@@ -12,6 +12,8 @@ import click
 
 Command = Callable[..., Any]
 SEED = click.IntRange(0, 2**63 - 1)
+# What may not be read is a system error (5), not bad usage (2); the stages say so.
+PATH = click.Path(path_type=Path, readable=False)
 
 
 def available_cores() -> int:
@@ -22,7 +24,7 @@ def available_cores() -> int:
 
 
 def output(help: str) -> Callable[[Command], Command]:
-    return click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help=help)
+    return click.option("-o", "--output", required=True, type=PATH, help=help)
 
 
 def workers(command: Command) -> Command:

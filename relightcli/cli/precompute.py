@@ -11,7 +11,7 @@ from relightcli.cli import options
 
 
 @click.command(name="precompute")
-@click.argument("scene", type=click.Path(path_type=Path))
+@click.argument("scene", type=options.PATH)
 @options.output("Transfer store to make, e.g. transfer.zarr.")
 @click.option("--effects", default="auto", show_default=True, help="auto, all, or names: direct,shadows.")
 @click.option(

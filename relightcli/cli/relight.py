@@ -11,7 +11,7 @@ from relightcli.cli import options
 
 
 @click.command(name="relight")
-@click.argument("store", type=click.Path(path_type=Path))
+@click.argument("store", type=options.PATH)
 @click.option(
     "-o",
     "--output",
@@ -23,7 +23,7 @@ from relightcli.cli import options
 @click.option("--camera", default=None, help="Camera of the scene. Default: its first.")
 @click.option("--set", "settings", multiple=True, metavar="MATERIAL.PARAMETER=VALUE", help="Change a material.")
 @click.option(
-    "--frames", default=None, type=click.Path(path_type=Path), help="Keyframes (TOML); output name with ####."
+    "--frames", default=None, type=options.PATH, help="Keyframes (TOML); output name with ####."
 )
 @click.option("--layers", is_flag=True, help="Write the parts of the picture as EXR layers.")
 @click.option("--background", type=click.Choice(["none", "env"]), default="none", help="What misses show.")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
 
 import pytest
 
+from relightcli.adapters import files
+from relightcli.cli.main import run
 from tests.faults import harness
 
 
@@ -15,9 +18,7 @@ from tests.faults import harness
 def test_full_disk(undisturbed, folder, limit, workers):
     """100 bytes: the first metadata; 1000: a mesh array; 20,000: a block's visibility, in the worker."""
     before = harness.limit_file_size(limit)
-    code, stderr = harness.run(
-        folder, *harness.PRECOMPUTE, "-o", "t.zarr", "--workers", workers, "-q", before=before
-    )
+    code, stderr = harness.run(folder, *harness.PRECOMPUTE, "-o", "t.zarr", "--workers", workers, "-q", before=before)
     assert code == 5, stderr
     assert str(folder / "t.zarr.partial") in stderr
     assert "File too large" in stderr
@@ -28,12 +29,18 @@ def test_full_disk(undisturbed, folder, limit, workers):
     assert harness.content(folder / "t.zarr") == harness.content(undisturbed)
 
 
-@pytest.mark.parametrize("name", ["out.exr", "out.png", "out.hdr", "out.tif", "out.ply"])
-def test_full_disk_under_a_picture(finished, name):
+@pytest.mark.parametrize("name", ["out.exr", "out.png", "out.jpg", "out.hdr", "out.tif", "out.ply"])
+def test_full_disk_under_a_picture(finished, monkeypatch, capsys, name):
+    """Nothing is left of the new picture, and the old one is as it was. The disk is full when data is to reach it."""
+
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.chdir(finished)
+    monkeypatch.setattr(files.os, "fsync", full)
     (finished / name).write_bytes(b"old")
-    code, stderr = harness.run(finished, "relight", "t.zarr", "-o", name, before=harness.limit_file_size(500))
-    assert code == 5, stderr
-    assert f"{name}: File too large" in stderr
+    assert run(["relight", "t.zarr", "-o", name]) == 5
+    assert f"relightcli: {name}: No space left on device\n" == capsys.readouterr().err
     assert (finished / name).read_bytes() == b"old"
     assert [p.name for p in finished.iterdir() if "partial" in p.name] == []
 

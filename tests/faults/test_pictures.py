@@ -9,7 +9,7 @@ import pytest
 
 from tests.faults import harness
 
-FRAMES = 'format = 1\nframes = 40\n[[key]]\nframe = 1\nenv_rotate = 0\n[[key]]\nframe = 41\nenv_rotate = 360\n'
+FRAMES = "format = 1\nframes = 40\n[[key]]\nframe = 1\nenv_rotate = 0\n[[key]]\nframe = 41\nenv_rotate = 360\n"
 
 
 @pytest.mark.slow
@@ -51,7 +51,7 @@ def test_two_relights_at_once(finished):
 
 
 # 16 rows of 400 pixels at 2,500 samples are 2 blocks of 8 million paths.
-WIDE = '[cameras.wide]\neye = [0, 1.5, 4]\ntarget = [0, 0.5, 0]\nfov = 5\nsize = [400, 16]\n'
+WIDE = "[cameras.wide]\neye = [0, 1.5, 4]\ntarget = [0, 0.5, 0]\nfov = 5\nsize = [400, 16]\n"
 REFERENCE = ("relight", "scene.toml", "--reference", "--camera", "wide", "--spp", 2500, "--workers", 1)
 
 

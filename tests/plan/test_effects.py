@@ -60,7 +60,10 @@ def test_what_blocks():
         two,
         (np.concatenate([SQUARE, SQUARE[:, [1, 0, 2]]]), np.concatenate([SQUARE_FACES, SQUARE_FACES + 4])),
         # Two squares of one plane that look to opposite sides: nothing blocks, but it is not called flat.
-        (np.concatenate([SQUARE, SQUARE + np.array([2, 0, 0])]), np.concatenate([SQUARE_FACES, SQUARE_FACES[:, ::-1] + 4])),
+        (
+            np.concatenate([SQUARE, SQUARE + np.array([2, 0, 0])]),
+            np.concatenate([SQUARE_FACES, SQUARE_FACES[:, ::-1] + 4]),
+        ),
     ):
         assert blocks_nothing(np.asarray(positions, float), faces.astype(np.int32)) is None
 

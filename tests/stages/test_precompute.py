@@ -311,3 +311,22 @@ def test_interrupted_programs_say_so_and_resume(long_scene, tmp_path, signum):
     process.kill()  # and killed, for good measure
     process.communicate()
     assert not output.exists()
+
+
+def test_an_interrupt_while_libraries_load_is_not_lost(scene, tmp_path):
+    # trimesh catches everything that its optional imports raise; the interrupt comes at the first of them.
+    code = (
+        "import os, signal, sys\n"
+        "class Finder:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.startswith('trimesh.') and not self.done:\n"
+        "            self.done = True\n"
+        "            os.kill(os.getpid(), signal.SIGINT)\n"
+        "    done = False\n"
+        "sys.meta_path.insert(0, Finder())\n"
+        "from relightcli.cli.main import run\n"
+        f"sys.exit(run(['precompute', {str(scene)!r}, '-o', {str(tmp_path / 't.zarr')!r}, '--workers', '1']))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, timeout=60, check=False)
+    assert done.returncode == 130, done.stderr.decode()
+    assert not (tmp_path / "t.zarr").exists()
