@@ -25,7 +25,7 @@ from benchmarks.scenes import Setting, main_store, two_skies, write_scene
 
 VARIANTS = ("llvm_ad_rgb", "scalar_rgb")  # the first that works; an unsuitable libLLVM ends the process
 CAMERA = "square"
-TARGET_ERROR = 0.02
+TARGET_ERROR, TARGET_RATIO = 0.02, 100.0
 
 
 def our_pictures(store: Path, sky: Path) -> tuple[NDArray[np.float32], float, float]:
@@ -137,13 +137,12 @@ def measure(setting: Setting) -> Report:
         at_asked, at_equal = seconds_at(found, asked), seconds_at(found, max(error, 1e-6))
         peer = f"Mitsuba ({variants[0]})"
         report.rows += [
-            faster(
+            against_mitsuba(
                 f"{name}: a frame, error {error:.2%}",
                 seconds,
-                "s",
                 f"{peer}, error {asked:.2%}: {at_asked:.3g} s",
                 at_asked / seconds,
-                100,
+                variants[0],
             ),
             Row(f"{name}: the same, equal error", seconds, "s", f"{peer}: {at_equal:.3g} s", at_equal / seconds),
             Row(
@@ -161,6 +160,13 @@ def measure(setting: Setting) -> Report:
         Table("as measured", ("sky", "program", "samples a pixel", "seconds", "error, %"), tuple(rows))
     )
     return report
+
+
+def against_mitsuba(work: str, seconds: float, against: str, ratio: float, variant: str) -> Row:
+    """The row with the target; against the slow variant nothing is claimed."""
+    if variant == VARIANTS[0]:
+        return faster(work, seconds, "s", against, ratio, TARGET_RATIO)
+    return Row(work, seconds, "s", against, ratio, f">= {TARGET_RATIO:g}x of {VARIANTS[0]}")
 
 
 def seconds_at(found: dict[str, Any], error: float) -> float:

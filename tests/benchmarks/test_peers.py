@@ -79,6 +79,12 @@ def test_time_at_an_error():
     assert mitsuba.seconds_at(found, 10.0) == 0.1 + 0.01  # no less than one sample
 
 
+def test_the_slow_variant_meets_no_target():
+    assert mitsuba.against_mitsuba("w", 0.1, "", 101.0, "llvm_ad_rgb").met
+    assert not mitsuba.against_mitsuba("w", 0.1, "", 99.0, "llvm_ad_rgb").met
+    assert mitsuba.against_mitsuba("w", 0.1, "", 1000.0, "scalar_rgb").met is None
+
+
 def test_samples_and_shares_cover():
     assert len(sample(100, 1000)) == 100
     rows = sample(10_000, 640)

@@ -22,10 +22,14 @@ TIMED = ("zarr.json", "ledger/zarr.json")
 _started: list[subprocess.Popen[str]] = []
 
 
-def start(folder: Path, *arguments: object, before=None) -> subprocess.Popen[str]:
-    """Starts `relightcli ...` in `folder`, leader of a process group of its own."""
+def start(folder: Path, *arguments: object, before=None, first: str = "") -> subprocess.Popen[str]:
+    """Starts `relightcli ...` in `folder`, leader of a process group of its own.
+
+    before: called in the child before the program. first: Python that the program runs first.
+    """
+    program = ["-c", f"{first}\nfrom relightcli.cli.main import main\nmain()"] if first else ["-m", "relightcli"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "relightcli", *map(str, arguments)],
+        [sys.executable, *program, *map(str, arguments)],
         cwd=folder,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
@@ -61,8 +65,8 @@ def finish(process: subprocess.Popen[str], timeout: float = 120) -> tuple[int, s
     return process.returncode, stderr
 
 
-def run(folder: Path, *arguments: object, before=None) -> tuple[int, str]:
-    return finish(start(folder, *arguments, before=before))
+def run(folder: Path, *arguments: object, before=None, first: str = "") -> tuple[int, str]:
+    return finish(start(folder, *arguments, before=before, first=first))
 
 
 def kill_group(process: subprocess.Popen[str]) -> None:

@@ -1,4 +1,4 @@
-"""The machine says no: full disks and folders that cannot be written. Code 5, the file's name, and a rerun that works."""
+"""The machine says no: full disks and folders that cannot be written. Code 5, the file's name, a rerun that works."""
 
 from __future__ import annotations
 

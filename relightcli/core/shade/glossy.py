@@ -3,8 +3,7 @@
 For a receiver with viewer v the integral of L V s(l, v) dl, s the specular lobe with its cosine, is summed over a
 quadtree of the sky cube's texels. A cell that is empty, dark or far from the lobe is passed over; one over which the
 lobe hardly changes is taken whole, at the mean direction of its light, with the light of its visible texels; any other
-is opened, down to single texels. Lobes narrower than a texel are sampled instead: a fixed set of directions,
-distributed as the lobe, looks up the map itself and the texel's visibility.
+is opened, down to single texels. Lobes narrower than a texel are left to `narrow`.
 """
 
 from __future__ import annotations
@@ -30,14 +29,11 @@ from relightcli.core.brdf.models import (
     lobes_and_density,
     tan2_between,
 )
-from relightcli.core.brdf.sampling import sample_direction
 from relightcli.core.lights.environment import SkyCube
-from relightcli.core.lights.latlong import texel_of
+from relightcli.core.shade.narrow import add_suns, sample_lobe, suns
 from relightcli.core.sphere import cube
-from relightcli.core.sphere.lattice import r2_point
 
 TOP = 8  # side of the quadtree's largest cells, in texels
-SAMPLES = 256  # directions for lobes narrower than a texel
 # A cell is taken whole when the lobe's exponent changes less than this over it; the error is of second order, because
 # the cell's light sits at its own mean direction. Measured in tests/core/shade/test_glossy.py.
 CHANGE = 0.5
@@ -50,7 +46,8 @@ class SkyTree:
 
     first (4,) int64: index of each level's first cell; flux (C, 3) float64; direction (C, 3) float64 unit, mean
     direction of the cell's light; reach (C,) float64: largest angle in radians between it and the cell's corners.
-    map (H, W, 3) float32 lat-long radiance, turned by `rotation` radians about +Y.
+    map (H, W, 3) float32 lat-long radiance, turned by `rotation` radians about +Y; `clamped` the same without its suns.
+    sun_direction, sun_flux (S, 3) float64: points of the brightest pixels and what `clamped` lacks there, times sr.
     """
 
     resolution: int
@@ -60,6 +57,9 @@ class SkyTree:
     reach: NDArray[np.float64]
     map: NDArray[np.float32]
     rotation: float
+    clamped: NDArray[np.float32]
+    sun_direction: NDArray[np.float64]
+    sun_flux: NDArray[np.float64]
 
 
 def sky_tree(sky: SkyCube, radiance: NDArray[np.float32], rotate_degrees: float) -> SkyTree:
@@ -82,6 +82,7 @@ def sky_tree(sky: SkyCube, radiance: NDArray[np.float32], rotate_degrees: float)
         np.concatenate([level[2] for level in levels]),
         np.ascontiguousarray(radiance, np.float32),
         math.radians(rotate_degrees),
+        *suns(np.ascontiguousarray(radiance, np.float32), math.radians(rotate_degrees)),
     )
 
 
@@ -128,6 +129,9 @@ def specular_radiance(
                 tree.reach,
                 tree.map,
                 tree.rotation,
+                tree.clamped,
+                tree.sun_direction,
+                tree.sun_flux,
                 out[a:b],
             )
             for a, b in itertools.pairwise(cuts)
@@ -192,6 +196,9 @@ def _integrate(  # type: ignore[no-untyped-def]
     reach,
     radiance,
     rotation,
+    clamped,
+    sun_direction,
+    sun_flux,
     out,
 ):
     tiles = resolution // TOP
@@ -208,8 +215,14 @@ def _integrate(  # type: ignore[no-untyped-def]
         if not dot(n, v) > 0.0:
             continue
         i = rows[m]
-        if _lobe_width(model, row) < 2.0 / resolution:
-            _sample_lobe(bits, i, n, v, model, row, resolution, radiance, rotation, out, m)
+        width = _lobe_width(model, row)
+        # Seen at a low angle a lobe is narrower still.
+        if width * min(1.0, 3.0 * dot(n, v)) < 2.0 / resolution:
+            if width > 0.5 * math.pi / len(radiance):
+                sample_lobe(bits, i, n, v, model, row, resolution, clamped, rotation, out, m)
+                add_suns(bits, i, n, v, model, row, resolution, sun_direction, sun_flux, out, m)
+            else:
+                sample_lobe(bits, i, n, v, model, row, resolution, radiance, rotation, out, m)
             continue
         red = green = blue = 0.0
         for face in range(6):
@@ -278,48 +291,3 @@ def _block(size):  # type: ignore[no-untyped-def]
     if size == 2:
         return np.uint64(0x0303)
     return np.uint64(1)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _texel_of(x, y, z, resolution):  # type: ignore[no-untyped-def]
-    ax, ay, az = abs(x), abs(y), abs(z)
-    if ax >= ay and ax >= az:
-        face = 0 if x > 0 else 1
-        s, t, w = (-z if x > 0 else z), -y, ax
-    elif ay >= az:
-        face = 2 if y > 0 else 3
-        s, t, w = x, (z if y > 0 else -z), ay
-    else:
-        face = 4 if z > 0 else 5
-        s, t, w = (x if z > 0 else -x), -y, az
-    column = min(resolution - 1, int((s / w + 1.0) * 0.5 * resolution))
-    row = min(resolution - 1, int((t / w + 1.0) * 0.5 * resolution))
-    return face, row, column
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _sample_lobe(bits, i, n, v, model, row, resolution, radiance, rotation, out, m):  # type: ignore[no-untyped-def]
-    black = (0.0, 0.0, 0.0)
-    # A white specular colour: the sampler picks the specular lobe, whatever its colour is.
-    white = row.copy()
-    white[SPECULAR : SPECULAR + 3] = 1.0
-    red = green = blue = 0.0
-    for q in range(SAMPLES):
-        u1, u2 = r2_point(q)
-        l, usable = sample_direction(model, white, black, n, v, u1, u2)  # noqa: E741
-        if not usable:
-            continue
-        face, r, c = _texel_of(l[0], l[1], l[2], resolution)
-        if not (bits[i, face, r, c >> 3] >> np.uint8(c & 7)) & np.uint8(1):
-            continue
-        _, s, _, density = lobes_and_density(model, row, n, l, v)
-        if not density > 0.0:
-            continue
-        y, x = texel_of(radiance.shape[0], radiance.shape[1], rotation, l)
-        weight = s / density
-        red += weight * radiance[y, x, 0]
-        green += weight * radiance[y, x, 1]
-        blue += weight * radiance[y, x, 2]
-    out[m, 0] = red / SAMPLES
-    out[m, 1] = green / SAMPLES
-    out[m, 2] = blue / SAMPLES

@@ -71,10 +71,13 @@ def name(material):
 @pytest.mark.parametrize("material", WIDE, ids=name)
 def test_quadtree_against_all_texels(trees, material):
     rms, most, mean = (1.4e-2, 2.4e-2, 7e-3) if name(material) == "blinn-phong-100.0" else (8e-3, 1.6e-2, 5e-3)
+    # Lobes hardly wider than a texel are sampled where they are seen at a low angle: texels are no truth there.
+    sampled = material.model == "cook-torrance" and material.roughness < 0.1
+    steep = np.einsum("nx,nx->n", NORMALS, VIEWS) > 0.34 if sampled else slice(None)
     for tree in trees.values():
         for bits in (OPEN, BLOCKED):
-            truth = all_texels(bits, material, tree)
-            error = radiance(bits, material, tree) - truth
+            truth = all_texels(bits, material, tree)[steep]
+            error = radiance(bits, material, tree)[steep] - truth
             assert math.sqrt((error**2).mean() / (truth**2).mean()) < rms
             assert np.abs(error).max() < most * truth.max()
             assert abs(error.mean()) < mean * truth.mean()
@@ -96,14 +99,14 @@ def fine_sum(material, pixels, i, fine=512):
 
 # What texels of 1.8 degrees cost a lobe that is hardly wider, under a smooth sky: worst at grazing view, where half-
 # vector lobes shrink by the cosine of the viewer. Measured, for viewers at 1, 33, 60 and 83 degrees:
-# roughness 0.05 within 0.3 % but 5 % at 83 degrees, 0.1 within 0.3 %, 0.3 within 0.5 %.
-@pytest.mark.parametrize(("roughness", "bound", "grazing"), [(0.05, 0.01, 0.06), (0.1, 0.01, 0.01), (0.3, 0.01, 0.01)])
-def test_texels_against_a_finer_sum(trees, roughness, bound, grazing):
+# roughness 0.05 within 0.3 % (sampled at 83 degrees), 0.1 within 0.3 %, 0.3 within 0.5 %.
+@pytest.mark.parametrize("roughness", [0.05, 0.1, 0.3])
+def test_texels_against_a_finer_sum(trees, roughness):
     material = shiny("cook-torrance", roughness=roughness)
     found = radiance(OPEN, material, trees["smooth"])
     for i in (0, 9, 16, 23):
         truth = fine_sum(material, MAPS["smooth"], i)
-        np.testing.assert_allclose(found[i], truth, rtol=grazing if i == 23 else bound)
+        np.testing.assert_allclose(found[i], truth, rtol=0.01)
 
 
 NARROW = [
@@ -242,9 +245,6 @@ def test_a_small_sun_in_a_lobe(material, bound):
         assert found == pytest.approx(truth, rel=bound)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="256 samples of a lobe that is wider than the sun and narrower than a texel miss it"
-)
 @pytest.mark.parametrize("roughness", [0.01, 0.02, 0.03])
 def test_a_small_sun_in_a_narrow_lobe(roughness):
     for i in (0, 8, 16):
