@@ -85,6 +85,10 @@ def run(arguments: list[str]) -> int:
             traceback.print_exc()
         code, message = exit_code(error)
         click.echo(f"relightcli: {message}", err=True)
+        try:
+            sys.stdout.flush()
+        except OSError:  # the interpreter would try again at exit, and end with another code
+            sys.stdout = open(os.devnull, "w")  # noqa: SIM115
         return code
 
 

@@ -46,10 +46,10 @@ def edit(folder, old, new):
         ("roughness = 0.3", "roughness = 0", ("materials.ball.roughness", "from 0.0001 to 10, found 0")),
         ("f0 = 0.04", "f0 = 1.5", ("materials.ball.f0", "from 0 to 1, found 1.5")),
         ("model = 'lambert'", "model = 'lambda'", ("materials.ground.model", "Did you mean 'lambert'?")),
-        ("fov = 40.0", "fov = 180", ("cameras.main.fov", "less than 180", "found 180")),
+        ("fov = 40.0", "fov = 180", ("cameras.main.fov", "below 180 degrees", "found 180")),
         ("size = [8, 6]", "size = [0, 6]", ("cameras.main.size", "whole numbers", "found [0, 6]")),
         ("map = 'sky-sky.exr'", "map = 'none.exr'", ("environments.sky.map", "no such file")),
-        ("two_sided = false", "motion = 'rigid'", ("motion", "ground")),
+        ("two_sided = false", "motion = 'rigid'", ("objects.ground.motion", "'rigid'", "--effects direct,shadows")),
         ("two_sided = false", "translate = [1e300, 0, 0]", ("objects.ground", "beyond 1e+30")),
     ],
 )
@@ -295,6 +295,7 @@ def test_negative_and_odd_environments_are_taken_with_a_note(here, capsys):
 
 def test_reference_reads_scene_files_within_their_folder_only(here, refused):
     (here / "inner").mkdir()
-    (here / "inner" / "scene.toml").write_text((here / "scene.toml").read_text().replace("'ball.obj'", "'../ball.obj'"))
+    text = (here / "scene.toml").read_text().replace("'ground.obj'", "'../ground.obj'")
+    (here / "inner" / "scene.toml").write_text(text)
     arguments = ("relight", "inner/scene.toml", "--reference", "-o", "out.exr", "--env", "sky-sky.exr")
-    refused(arguments, ("objects.ball.mesh", "--allow-outside"))
+    refused(arguments, ("objects.ground.mesh", "--allow-outside"))

@@ -159,9 +159,6 @@ def test_any_folder_and_any_name(here, tmp_path):
     place = tmp_path / "sp ace" / "ünï — 光"
     place.parent.mkdir()
     Path(here).rename(place)
-    (place / "sky-sky.exr").rename(place / "ský.exr")
-    text = (place / "scene.toml").read_text().replace("sky-sky.exr", "ský.exr")
-    (place / "scene.toml").write_text(text)
     for locale in ("LC_ALL=C.UTF-8", "LC_ALL=C PYTHONUTF8=0 PYTHONCOERCECLOCALE=0"):
         done = shell(
             f"cd / && {locale} $R precompute '{place}/scene.toml' -o '{place}/a ü.zarr' --light-resolution 16 "
