@@ -158,7 +158,8 @@ def _encode_linear(suffix: str, pixels: NDArray[np.float32], names: list[str], m
         spec.attribute("colorInteropID", "lin_rec709_scene")
         spec.attribute("chromaticities", "float[8]", REC709)
         for key, value in metadata.items():
-            spec.attribute(key, value)
+            # OpenImageIO takes UTF-8; paths may hold bytes that are none.
+            spec.attribute(key, os.fsencode(value).decode("utf-8", "replace") if isinstance(value, str) else value)
     elif metadata:
         spec.attribute("ImageDescription", json.dumps(metadata, sort_keys=True))
     with _memory_file(suffix) as (name, read):

@@ -103,6 +103,8 @@ def _occupy_closed_streams() -> None:
         os.open(os.devnull, os.O_WRONLY if name == "stdin" else os.O_RDONLY)  # takes the lowest free number
         if name == "stdout":
             sys.stdout = open(number, "w", closefd=False)  # noqa: SIM115
+        elif name == "stderr":
+            sys.stderr = open(os.devnull, "w")  # noqa: SIM115
 
 
 def _drop_stdout() -> None:

@@ -71,7 +71,10 @@ def precompute(config: Config) -> dict[str, Any]:
     need_output(config.output)
     asked = effects.parse_effects(config.effects)
     scene = load_scene(config.scene, allow_outside=config.allow_outside)
-    effects.need_static({o.name: o.motion for o in scene.objects.values()}, asked)
+    try:
+        effects.need_static({o.name: o.motion for o in scene.objects.values()}, asked)
+    except InputError as error:
+        raise InputError(f"{scene.path}: {error}") from None
     geometry = build_geometry(scene)
     both = _both_sides(scene, geometry)
     check_receivers(config.receivers, scene, geometry, both)

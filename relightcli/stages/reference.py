@@ -106,9 +106,12 @@ def render_reference(config: Config, shots: list[Shot], suffix: str, started: fl
     check_shots(config, shots, scene)
     bounces = config.bounces if config.bounces is not None else 0
     written, rays = [], 0
+    notes: list[str] = []
     for shot in shots:
         environment = resolve_environment(shot.env, scene.environments)
         camera = resolve_camera(shot.camera, scene.cameras)
+        # Read here for what it has to say, and so that a bad map leaves no unfinished work behind.
+        notes += [note for note in images.read_environment_with_notes(environment)[1] if note not in notes]
         name = config.output if config.output != "-" else "relight-stdout.exr"
         if config.frames is not None:
             name = numbered(name, shot.number)
@@ -193,7 +196,7 @@ def render_reference(config: Config, shots: list[Shot], suffix: str, started: fl
         "spp": passes * per_pass,
         "rays": rays,
         "seconds": time.perf_counter() - started,
-        "notes": [],
+        "notes": notes,
     }
 
 

@@ -150,7 +150,7 @@ def test_inconsistent_winding(tmp_path):
     for part in mixed.values():
         part.triangles = part.triangles.copy()
         part.triangles[::2] = part.triangles[::2, ::-1]
-    found, alpha = shot(tmp_path / "mixed", mixed)
+    found, _ = shot(tmp_path / "mixed", mixed)
     assert (found <= expected + 1e-5).all()
     assert 0 < found.sum() < expected.sum()
     shot(tmp_path / "both", mixed, two_sided=True)

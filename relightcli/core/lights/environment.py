@@ -58,7 +58,7 @@ def latlong_to_cube(radiance: NDArray[np.float32], resolution: int, rotate_degre
     k = np.floor(np.mod(middle - turn + math.pi, 2.0 * math.pi) * (width / (2.0 * math.pi))).astype(np.int64)
     column_of = width - 1 - np.clip(k, 0, width - 1)
     row_edges = np.cos(math.pi * np.arange(height + 1) / height)[::-1].copy()  # rising s, from the south pole
-    row_half_angles = np.array([_half_angle(s) for s in row_edges])
+    row_half_angles = 0.5 * (np.arcsin(row_edges) + row_edges * np.sqrt(np.maximum(0.0, 1.0 - row_edges**2)))
     source = np.ascontiguousarray(radiance, np.float32)
     parts = [np.zeros((6 * resolution * resolution, 3, 4)) for _ in range(2)]
     cut = len(column_of) // 2

@@ -10,9 +10,12 @@ from __future__ import annotations
 import itertools
 import math
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
-from numba import njit
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from relightcli.core.lights.environment import SkyCube
@@ -56,6 +59,16 @@ def irradiance(
     return out
 
 
+@intrinsic
+def _trailing_zeros(typing_context: Any, word: Any) -> Any:
+    """Index of the lowest set bit of a uint64 that is not zero: the processor's own instruction."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
+
+    return types.int64(types.uint64), generate
+
+
 @njit(cache=True, nogil=True)
 def _sum_runs(words, normals, active, prefix, out):  # type: ignore[no-untyped-def]
     one = np.uint64(1)
@@ -75,8 +88,7 @@ def _sum_runs(words, normals, active, prefix, out):  # type: ignore[no-untyped-d
             carry = word >> top
             while change != zero:
                 low = change & (~change + one)
-                # index of the lowest set bit
-                at = 64 * w + _trailing_zeros(low)
+                at = 64 * w + _trailing_zeros(low)  # type: ignore[call-arg]
                 for q in range(9):
                     acc[q] += sign * prefix[at, q]
                 sign = -sign
@@ -87,27 +99,3 @@ def _sum_runs(words, normals, active, prefix, out):  # type: ignore[no-untyped-d
         for c in range(3):
             e = normals[i, 0] * acc[3 * c] + normals[i, 1] * acc[3 * c + 1] + normals[i, 2] * acc[3 * c + 2]
             out[i, c] = max(e, 0.0)
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _trailing_zeros(low):  # type: ignore[no-untyped-def]
-    """Index of the only set bit of a 64-bit word, by the exponent of its float (powers of two are exact)."""
-    n = 0
-    if low >> np.uint64(32):
-        n += 32
-        low >>= np.uint64(32)
-    if low >> np.uint64(16):
-        n += 16
-        low >>= np.uint64(16)
-    if low >> np.uint64(8):
-        n += 8
-        low >>= np.uint64(8)
-    if low >> np.uint64(4):
-        n += 4
-        low >>= np.uint64(4)
-    if low >> np.uint64(2):
-        n += 2
-        low >>= np.uint64(2)
-    if low >> np.uint64(1):
-        n += 1
-    return n
