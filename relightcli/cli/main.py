@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import signal
 import sys
@@ -57,6 +58,8 @@ def run(arguments: list[str]) -> int:
     signal.signal(signal.SIGTERM, _interrupt)
     _occupy_closed_streams()
     verbose = any(a == "--verbose" or (a.startswith("-v") and a.strip("v") == "-") for a in arguments)
+    # After an error zarr's event loop complains, with tracebacks, about the chunks that nobody waits for any more.
+    logging.getLogger("asyncio").disabled = not verbose
     try:
         result: Any = group.main(arguments, prog_name="relightcli", standalone_mode=False)
         sys.stdout.flush()

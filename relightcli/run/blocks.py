@@ -7,6 +7,7 @@ workers nor on the order nor on interruptions.
 
 from __future__ import annotations
 
+import logging
 import os
 import resource
 import signal
@@ -132,6 +133,8 @@ def _start_worker(parent: int) -> None:
     """A worker leaves interrupts to its parent and does not outlive it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _leave_worker)
+    # The parent says what went wrong; zarr's event loop would complain about every chunk beside it.
+    logging.getLogger("asyncio").disabled = True
 
     def watch() -> None:
         while os.getppid() == parent:
