@@ -83,7 +83,10 @@ def check_section(folder: Path, log: Path, sky: str) -> Section:
     pictures = [
         Picture(png_data_uri(to_display(relit, exposure)), f"From the store: {command(log, f'small-{sky}')}"),
         Picture(png_data_uri(to_display(reference, exposure)), f"Path-traced: {command(log, f'reference-{sky}')}"),
-        Picture(picture_uri(folder / f"heatmap-{sky}.png"), f"Where they differ, the brighter the more; report-{sky}.html has the scale"),
+        Picture(
+            picture_uri(folder / f"heatmap-{sky}.png"),
+            f"Where they differ, the brighter the more; report-{sky}.html has the scale",
+        ),
     ]
     rows = [[metric, value, limits[metric]] for metric, value in item["metrics"].items()]
     verdict = "Within the limits." if result["passed"] else "Beyond the limits."

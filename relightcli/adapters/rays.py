@@ -56,9 +56,7 @@ class Tracer:
         """World points (..., 3) in the normalised frame, float32."""
         return np.ascontiguousarray((np.asarray(points, np.float64) - self.center) * self.scale, dtype=np.float32)
 
-    def offset(
-        self, points: NDArray[np.floating[Any]], normals: NDArray[np.floating[Any]]
-    ) -> NDArray[np.float32]:
+    def offset(self, points: NDArray[np.floating[Any]], normals: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
         """Origins (N, 3) float32, normalised frame: world points moved off their surface along `normals`."""
         local = (np.asarray(points, np.float64) - self.center) * self.scale
         return np.ascontiguousarray(local + SURFACE_OFFSET * np.asarray(normals, np.float64), dtype=np.float32)
