@@ -27,7 +27,7 @@ demo: $(VENV)/.base  ## the main job on a built-in scene; leaves demo/index.html
 	$(MAKE) --no-print-directory -C recipes/demo RELIGHTCLI=$(abspath $(BIN))/relightcli PYTHON=$(abspath $(BIN))/python OUT=$(abspath demo)
 
 test: $(VENV)/.test
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n auto --dist worksteal --durations 25
 
 lint: $(VENV)/.lint
 	$(BIN)/ruff check .
