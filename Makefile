@@ -44,3 +44,4 @@ recipes: $(VENV)/.base  ## every recipe end to end; each ends in a check
 
 clean:
 	rm -rf $(VENV) demo build
+	find relightcli -name '*.nb[ic]' -delete  # compiled loops: a change in another file does not renew them

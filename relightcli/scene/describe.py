@@ -65,10 +65,8 @@ def scene_to_json(scene: Scene, geometry: Geometry | None = None) -> dict[str, A
     if geometry is not None:
         description["geometry"] = {
             "notes": list(geometry.notes),
-            "vertices": {
-                name: int((geometry.vertex_object == i).sum()) for i, name in enumerate(geometry.object_names)
-            },
-            "faces": {name: int((geometry.face_object == i).sum()) for i, name in enumerate(geometry.object_names)},
+            "vertices": _counts(geometry, geometry.vertex_object),
+            "faces": _counts(geometry, geometry.face_object),
         }
     return description
 

@@ -31,14 +31,10 @@ def relight(config: Config) -> dict[str, Any]:
     session = Session(lighting, config)
     opened = time.perf_counter() - started
     written, clocks = [], []
-    try:
-        for shot in shots:
-            clock = time.perf_counter()
-            written.append(session.write(shot, suffix))
-            clocks.append(time.perf_counter() - clock)
-    except BaseException:
-        session.abandon()
-        raise
+    for shot in shots:
+        clock = time.perf_counter()
+        written.append(session.write(shot, suffix))
+        clocks.append(time.perf_counter() - clock)
     session.finish()
     return {
         "store": str(config.store),

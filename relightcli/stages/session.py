@@ -56,7 +56,6 @@ class Session:
         self._tracer: Tracer | None = None
         self._maps: dict[str, str] = {}
         self._map: tuple[Path, NDArray[np.float32]] | None = None
-        self._writer: formats.Writer | None = None
         self._radiance: list[NDArray[np.float32]] = []
 
     def write(self, shot: Shot, suffix: str) -> str:
@@ -213,9 +212,6 @@ class Session:
             writer.put("radiance", radiance, dims=("frame", "receiver", "colour"), units="W sr-1 m-2")
             writer.put("receivers/position", self.lighting.position, dims=("receiver", "axis"), units="m")
             writer.commit({})
-
-    def abandon(self) -> None:
-        self._radiance = []
 
 
 def environment_behind(environment: NDArray[np.float32], rotate: float, camera: Camera) -> NDArray[np.float32]:
