@@ -46,9 +46,7 @@ def clear() -> None:
     """Ends what a test has left running."""
     while _started:
         process = _started.pop()
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
+        kill_group(process)
         process.stdout.close()
         process.stderr.close()
 
@@ -70,7 +68,9 @@ def run(folder: Path, *arguments: object, before=None, first: str = "") -> tuple
 
 
 def kill_group(process: subprocess.Popen[str]) -> None:
-    os.killpg(process.pid, signal.SIGKILL)
+    """Kills what is left of the group: none where the program has finished and been waited for."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
     process.wait()
 
 
