@@ -13,7 +13,12 @@ from relightcli.cli import options
 @click.command(name="precompute")
 @click.argument("scene", type=options.PATH)
 @options.output("Transfer store to make, e.g. transfer.zarr.")
-@click.option("--effects", default="auto", show_default=True, help="auto, all, or names: direct,shadows.")
+@click.option(
+    "--effects",
+    default="auto",
+    show_default=True,
+    help="auto, all, or names: direct,shadows,one-bounce,two-bounce,specular.",
+)
 @click.option(
     "--light-resolution", default=64, show_default=True, help="Texels along a face of the sky cube: 16 to 256."
 )
@@ -38,7 +43,10 @@ from relightcli.cli import options
     help="Haar: keep only as many coefficients as leave this relative RMS of a receiver's transfer out.",
 )
 @click.option("--sh-order", default=6, show_default=True, help="Bands of the spherical harmonics.")
-@click.option("--bounces", default=0, show_default=True, help="Interreflections to simulate (this version: 0).")
+@click.option("--bounces", default=None, type=int, help="Interreflections. Default: what --effects names, 0 with auto.")
+@click.option(
+    "--bounce-resolution", default=16, show_default=True, help="Cells along a cube face through which light bounces."
+)
 @click.option("--seed", default=0, type=options.SEED, show_default=True, help="Seed of the random checks.")
 @click.option("--allow-outside", is_flag=True, help="Let the scene file use files outside its folder.")
 @click.option("--dry-run", is_flag=True, help="Print the plan and its predicted cost; do nothing.")

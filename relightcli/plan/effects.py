@@ -1,7 +1,8 @@
 """Which effects a scene calls for, with the evidence.
 
-Names follow interface.md: direct, shadows, one-bounce, two-bounce, specular, fields, pose. This version simulates the
-first two; a scene or a user that needs another is told so.
+Names follow interface.md: direct, shadows, one-bounce, two-bounce, specular, fields, pose. This version does not
+simulate the last two; a scene or a user that needs one is told so. Interreflections are simulated when they are asked
+for, by name or by number. Specular lobes cost nothing here: they are integrated when a picture is made.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ from numpy.typing import NDArray
 from relightcli.errors import InputError
 
 KNOWN = ("direct", "shadows", "one-bounce", "two-bounce", "specular", "fields", "pose")
-AVAILABLE = ("direct", "shadows")
+AVAILABLE = ("direct", "shadows", "one-bounce", "two-bounce", "specular")
+BOUNCES = {"one-bounce": 1, "two-bounce": 2}
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,24 @@ def parse_effects(text: str) -> tuple[str, ...] | None:
             )
     if "direct" not in names:
         raise InputError("--effects: 'direct' must be among them: every other effect builds on it")
+    if "two-bounce" in names and "one-bounce" not in names:
+        raise InputError("--effects: 'two-bounce' needs 'one-bounce' beside it")
+    if "one-bounce" in names and "shadows" not in names:
+        raise InputError("--effects: 'one-bounce' needs 'shadows' beside it: light bounces off what blocks the sky")
     return names
+
+
+def bounces_asked(asked: tuple[str, ...] | None, bounces: int | None) -> int:
+    """Interreflections to simulate: `--bounces`, or what `--effects` names. Raises InputError if they contradict."""
+    named = max((BOUNCES.get(name, 0) for name in asked or ()), default=0)
+    if bounces is None:
+        return named
+    if asked is not None and min(bounces, 2) != named:
+        raise InputError(
+            f"--bounces {bounces}: --effects names {named or 'no'} bounces; expected the same (one-bounce, "
+            "two-bounce), or --effects auto"
+        )
+    return bounces
 
 
 def need_static(motions: dict[str, str], asked: tuple[str, ...] | None) -> None:
@@ -66,17 +85,32 @@ def decide(
     positions: NDArray[np.float64],
     faces: NDArray[np.int32],
     both_sides: bool,
+    bounces: int,
 ) -> list[Decision]:
-    """The plan for a static scene: `direct` always, `shadows` unless nothing can block anything."""
-    direct = Decision("direct", True, "always")
+    """The plan for a static scene: `direct` always, `shadows` unless nothing can block anything, `bounces` with it."""
+    shadows = _shadows(asked, positions, faces, both_sides)
+    plan = [Decision("direct", True, "always"), shadows]
+    for name, number in BOUNCES.items():
+        if bounces < number:
+            plan.append(Decision(name, False, "not asked for"))
+        elif not shadows.simulate:
+            plan.append(Decision(name, False, "no light can go from one point of the scene to another"))
+        else:
+            plan.append(Decision(name, True, f"asked for: {bounces} interreflections"))
+    return plan
+
+
+def _shadows(
+    asked: tuple[str, ...] | None, positions: NDArray[np.float64], faces: NDArray[np.int32], both_sides: bool
+) -> Decision:
     if asked is not None:
-        return [direct, Decision("shadows", "shadows" in asked, "asked for with --effects")]
+        return Decision("shadows", "shadows" in asked, "asked for with --effects")
     if both_sides:
-        return [direct, Decision("shadows", True, "objects lit from both sides")]
+        return Decision("shadows", True, "objects lit from both sides")
     shape = blocks_nothing(positions, faces)
     if shape is not None:
-        return [direct, Decision("shadows", False, f"{shape}: no point of it is above another point's horizon")]
-    return [direct, Decision("shadows", True, "the surfaces are not one convex body")]
+        return Decision("shadows", False, f"{shape}: no point of it is above another point's horizon")
+    return Decision("shadows", True, "the surfaces are not one convex body")
 
 
 def blocks_nothing(positions: NDArray[np.float64], faces: NDArray[np.int32]) -> str | None:

@@ -11,13 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 import relight_formats as formats
-from relightcli.core.brdf.models import SPECULAR, pack_materials
+from relightcli.core.brdf.models import SPECULAR, MaterialTable, pack_materials, widen
+from relightcli.core.brdf.separable import MOST_TERMS
 from relightcli.core.lights.environment import SkyCube, latlong_to_cube, splat
+from relightcli.core.shade.bounces import Exit, bounce
+from relightcli.core.shade.gather import Gather, build_gather, join
 from relightcli.core.shade.glossy import sky_tree, specular_radiance
 from relightcli.core.shade.irradiance import irradiance, moment_prefix
-from relightcli.core.shade.local import local_radiance
+from relightcli.core.shade.lobe_factors import lobe_factors, lobe_rows, sky_lobes
+from relightcli.core.shade.local import local_lobes, local_radiance
 from relightcli.core.sphere import haar, sh
 from relightcli.core.transport.local_lights import pack_lights
+from relightcli.core.transport.receivers import receivers_of_vertices
 from relightcli.errors import InputError, StoreError
 from relightcli.scene.describe import scene_from_json
 from relightcli.scene.model import Geometry, Material, Scene
@@ -32,6 +37,35 @@ class Radiance:
 
     diffuse: NDArray[np.float32]
     specular: NDArray[np.float32] | None
+
+
+def together(parts: list[Radiance]) -> Radiance:
+    """The sum of exit radiances."""
+    if len(parts) == 1:
+        return parts[0]
+    diffuse: NDArray[np.float32] = np.sum([part.diffuse for part in parts], axis=0)
+    lobes = [part.specular for part in parts if part.specular is not None]
+    return Radiance(diffuse, np.sum(lobes, axis=0) if lobes else None)
+
+
+@dataclass(frozen=True)
+class _Coats:
+    """The receivers' materials: index (N,) into `table`; albedo and transmittance (N, 3); partner (N,), the receiver on
+    the other side, where light comes through; shiny (N,), those with a specular lobe."""
+
+    material: NDArray[np.int32]
+    table: MaterialTable
+    albedo: NDArray[np.float32]
+    through: NDArray[np.float32]
+    partner: NDArray[np.int64] | None
+    shiny: NDArray[np.bool_]
+
+    def diffuse(self, e: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Diffuse exit radiance, (N, 3), of an irradiance (N, 3)."""
+        out: NDArray[np.float32] = e * self.albedo * np.float32(1.0 / np.pi)
+        if self.partner is not None:
+            out += e[self.partner] * self.through * np.float32(1.0 / np.pi)
+        return out
 
 
 def read_scene(store: formats.Store) -> tuple[Scene, Geometry]:
@@ -69,6 +103,8 @@ class LightingStore:
         self.vertex: NDArray[np.int32] | None = read("receivers/vertex") if "receivers/vertex" in self.store else None
         self.resolution = int(self.store.settings["light_resolution"])
         self.basis: str = self.store.settings["basis"]
+        self.bounces = int(self.store.settings["bounces"])
+        self._gathered: Gather | None = None
         self._bits: NDArray[np.uint8] | None = None
         layout = self.store.layouts["visibility/bits"]
         if layout.raw_bytes <= IN_MEMORY:
@@ -90,13 +126,7 @@ class LightingStore:
             raise StoreError(
                 f"{self.store.path}: its receivers are pixels of camera {self.camera_name!r}, not vertices"
             )
-        out = []
-        for side in (1, -1):
-            index: NDArray[np.int32] = np.full(len(self.geometry.positions), -1, np.int32)
-            pick = np.flatnonzero(self.side == side)
-            index[self.vertex[pick]] = pick
-            out.append(index)
-        return out[0], out[1]
+        return receivers_of_vertices(self.vertex, self.side, len(self.geometry.positions))
 
     def blocks(self) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
         """Visibility bits in ranges of receivers: all at once if they are in memory, else chunk by chunk."""
@@ -116,23 +146,54 @@ class LightingStore:
         view: NDArray[np.float32] | None,
         active: NDArray[np.bool_] | None = None,
         basis: str | None = None,
-    ) -> Radiance:
+        bounces: int | None = None,
+    ) -> list[Radiance]:
         """Exit radiance of the receivers under a lat-long map (H, W, 3) turned by `rotate` degrees.
 
-        view (N, 3): unit directions to the viewer, needed where a material has a specular lobe. active (N,): receivers
-        to light, the others get 0. basis: how diffuse light is computed; the store's own by default.
+        One entry for light that was reflected once, then one for each interreflection; they add up. view (N, 3): unit
+        directions to the viewer, needed where a material has a specular lobe. active (N,): receivers to light, the
+        others may get 0. basis: how diffuse light is computed; bounces: interreflections; the store's own by default.
         """
-        sky = latlong_to_cube(environment, self.resolution, rotate)
-        per_object = list(materials.values())
+        bounces = self.bounces if bounces is None else bounces
+        coats = self._coats(list(materials.values()))
+        if coats.shiny.any() and view is None:
+            raise InputError("a material with a specular lobe looks different from everywhere: a --camera is needed")
+        gather = self._gather() if bounces else None
+        lit = active if gather is None else None
+        direct = self._direct(environment, rotate, coats, view, active, lit, basis or self.basis)
+        if gather is None:
+            return [direct, *[Radiance(np.zeros_like(direct.diffuse), None)] * bounces]
+        return [direct, *self._bounces(gather, direct, environment, rotate, coats, view, active, bounces)]
+
+    def _coats(self, materials: list[Material]) -> _Coats:
         material = self.geometry.material[self.object]
-        table = pack_materials(per_object)
-        albedo = np.array([m.diffuse for m in per_object], np.float32)[material]
-        through = np.array([m.transmittance if m.model == "translucent" else BLACK for m in per_object], np.float32)
+        through = np.array([m.transmittance if m.model == "translucent" else BLACK for m in materials], np.float32)
         through = through[material]
-        partner = self._partner() if through.any() else None
+        return _Coats(
+            material,
+            pack_materials(materials),
+            np.array([m.diffuse for m in materials], np.float32)[material],
+            through,
+            self._partner() if through.any() else None,
+            np.array([m.model in SHINY and m.specular != BLACK for m in materials], bool)[material],
+        )
+
+    def _direct(
+        self,
+        environment: NDArray[np.float32],
+        rotate: float,
+        coats: _Coats,
+        view: NDArray[np.float32] | None,
+        looked_at: NDArray[np.bool_] | None,
+        active: NDArray[np.bool_] | None,
+        basis: str,
+    ) -> Radiance:
+        """Light that is reflected once: diffuse of `active` receivers, specular of those `looked_at` (None: all)."""
+        sky = latlong_to_cube(environment, self.resolution, rotate)
+        material, table, partner = coats.material, coats.table, coats.partner
         if partner is not None and active is not None:
             active = active | active[partner]  # light comes through from the other side
-        e = self._irradiance(sky, active, basis or self.basis)
+        e = self._irradiance(sky, active, basis)
         lamps = None
         if "lights/bits" in self.store:
             lamp_e, lamps = local_radiance(
@@ -147,15 +208,10 @@ class LightingStore:
                 self.threads,
             )
             e = e + lamp_e
-        diffuse = e * albedo * np.float32(1.0 / np.pi)
-        if partner is not None:
-            diffuse += e[partner] * through * np.float32(1.0 / np.pi)
-        shiny = np.array([m.model in SHINY and m.specular != BLACK for m in per_object], bool)[material]
-        if not shiny.any():
+        diffuse = coats.diffuse(e)
+        if not coats.shiny.any() or view is None:
             return Radiance(diffuse, None)
-        if view is None:
-            raise InputError("a material with a specular lobe looks different from everywhere: a --camera is needed")
-        rows = np.flatnonzero(shiny if active is None else shiny & active)
+        rows = np.flatnonzero(coats.shiny if looked_at is None else coats.shiny & looked_at)
         specular = np.zeros((len(self), 3), np.float32)
         tree = sky_tree(splat(sky), environment, rotate)
         for block, bits in self.blocks():
@@ -174,6 +230,87 @@ class LightingStore:
         if lamps is not None:
             specular += lamps * table.parameters[material][:, SPECULAR : SPECULAR + 3].astype(np.float32)
         return Radiance(diffuse, specular)
+
+    def _bounces(
+        self,
+        gather: Gather,
+        direct: Radiance,
+        environment: NDArray[np.float32],
+        rotate: float,
+        coats: _Coats,
+        view: NDArray[np.float32] | None,
+        active: NDArray[np.bool_] | None,
+        bounces: int,
+    ) -> Iterator[Radiance]:
+        """Exit radiance after each of `bounces` interreflections of the directly lit receivers."""
+        table = widen(coats.table, 0.5 * np.pi / gather.cells)
+        factors = lobe_factors(table)
+        row = lobe_rows(coats.material, factors)
+        lobe = np.zeros((int(row.max()) + 1, 6, MOST_TERMS), np.float32)
+        if len(lobe):
+            sky = splat(latlong_to_cube(environment, gather.cells, rotate))
+            for block, bits in self.blocks():
+                sky_lobes(bits, self.normal[block], coats.material[block], factors, sky, lobe, row[block], self.threads)
+            if "lights/bits" in self.store:
+                local_lobes(
+                    self.store.read("lights/bits"),
+                    pack_lights(self.scene.lights.values()),
+                    self.position,
+                    self.normal,
+                    coats.material,
+                    factors,
+                    lobe,
+                    row,
+                    self.threads,
+                )
+        tint = self._tint()
+        diffuse = direct.diffuse
+        mask = np.ones(len(self), bool) if active is None else active
+        if coats.partner is not None:
+            mask = mask | mask[coats.partner]
+        for number in range(1, bounces + 1):
+            light = Exit(diffuse if tint is None else diffuse * tint, lobe, row)
+            e, specular, lobe = bounce(
+                gather,
+                light,
+                self.normal,
+                coats.material,
+                table,
+                factors,
+                view,
+                mask,
+                number < bounces,
+                self.threads,
+            )
+            diffuse = coats.diffuse(e)
+            yield Radiance(diffuse, specular if coats.shiny.any() else None)
+
+    def _gather(self) -> Gather | None:
+        """Who sees whom; None where nothing blocks anything. Raises StoreError if that was not simulated."""
+        if "bounce/hit" not in self.store:
+            if "shadows" not in self.store.settings["effects"]:
+                return None
+            raise StoreError(
+                f"{self.store.path}: holds direct light only; precompute with --bounces 1 or more, or use --reference"
+            )
+        if self._gathered is None:
+            array: Any = self.store.array("bounce/hit")
+            self._gathered = join(
+                [
+                    build_gather(np.asarray(array[rows]), bits, self.normal[rows], self.threads)
+                    for rows, bits in self.blocks()
+                ]
+            )
+        return self._gathered
+
+    def _tint(self) -> NDArray[np.float32] | None:
+        """Colour of the texture at every receiver, (N, 3) float32; None without textures."""
+        if "bounce/texture" not in self.store:
+            return None
+        colours: Any = self.store.read("bounce/texture")
+        assert self.vertex is not None
+        tint: NDArray[np.float32] = colours[self.vertex]
+        return tint
 
     def _irradiance(self, sky: SkyCube, active: NDArray[np.bool_] | None, basis: str) -> NDArray[np.float32]:
         if basis == "visibility":

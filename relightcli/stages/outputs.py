@@ -71,10 +71,6 @@ def check(config: Config, suffix: str) -> None:
     for name, path in (("the store", config.store), ("--env", config.env)):
         if path is not None and _same_file(config.output, path):
             raise InputError(f"--output {config.output}: is {name} itself; expected another name")
-    if config.bounces is not None and not config.reference and config.bounces != 0:
-        raise InputError(
-            f"--bounces {config.bounces}: the store holds direct light (0 bounces); only --reference traces more"
-        )
 
 
 def _same_file(a: str | Path, b: str | Path) -> bool:
@@ -93,6 +89,12 @@ def check_shots(config: Config, shots: list[Shot], scene: Scene) -> None:
             if config.frames is None:
                 raise
             raise InputError(f"{config.frames}: frame {shot.number}: {error}") from None
+
+
+def layer_names(count: int) -> list[str]:
+    """Names of light that was reflected once, twice, ... `count` times."""
+    names = ("direct", "one_bounce", "two_bounce", "three_bounce", "four_bounce")
+    return [names[i] if i < len(names) else f"bounce_{i}" for i in range(count)]
 
 
 def numbered(pattern: str, number: int) -> str:

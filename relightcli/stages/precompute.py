@@ -16,6 +16,7 @@ from relightcli import __version__
 from relightcli.adapters.files import need_output
 from relightcli.adapters.rays import Tracer
 from relightcli.core.transport import visibility
+from relightcli.core.transport.hits import trace_hits
 from relightcli.core.transport.receivers import Receivers
 from relightcli.core.transport.tessellation import tessellate
 from relightcli.errors import InputError
@@ -31,12 +32,15 @@ from relightcli.stages.receiver_setup import (
     make_receivers,
     put_geometry,
     put_receivers,
+    put_vertex_colours,
+    surfaces_of,
 )
 from relightcli.stages.visibility_job import VisibilityJob, block_size, create_outputs
 
 KIND = "transfer"
 BASES = ("visibility", "haar", "sh", "dense")
 PILOT_GROUPS = 24  # groups of receivers that a dry run traces
+MOST_BOUNCES = 64
 WRONG_BITS = 1e-3  # share of wrong bits above which the user is told
 
 
@@ -55,7 +59,8 @@ class Config:
     coefficients: int = 128
     tolerance: float | None = None
     sh_order: int = 6
-    bounces: int = 0
+    bounces: int | None = None
+    bounce_resolution: int = 16
     seed: int = 0
     workers: int = 1
     overwrite: bool = False
@@ -70,6 +75,7 @@ def precompute(config: Config) -> dict[str, Any]:
     _check(config)
     need_output(config.output)
     asked = effects.parse_effects(config.effects)
+    bounces = effects.bounces_asked(asked, config.bounces)
     scene = load_scene(config.scene, allow_outside=config.allow_outside)
     try:
         effects.need_static({o.name: o.motion for o in scene.objects.values()}, asked)
@@ -78,23 +84,29 @@ def precompute(config: Config) -> dict[str, Any]:
     geometry = build_geometry(scene)
     both = _both_sides(scene, geometry)
     check_receivers(config.receivers, scene, geometry, both)
-    plan = effects.decide(asked, geometry.positions, geometry.faces, bool(both.any()))
-    shadows = next(d.simulate for d in plan if d.effect == "shadows")
+    if bounces:
+        _check_bounces(config)
+    plan = effects.decide(asked, geometry.positions, geometry.faces, bool(both.any()), bounces)
+    simulated = [d.effect for d in plan if d.simulate]
+    shadows = "shadows" in simulated
+    bounce_cells = config.bounce_resolution if "one-bounce" in simulated else 0
     source = geometry
     if shadows and config.subdivide and config.receivers == "vertices":
         geometry = _subdivided(geometry)
     if config.dry_run:
-        return _dry_run(config, scene, geometry, both, plan, shadows)
+        return _dry_run(config, scene, geometry, both, plan, shadows, bounce_cells)
     settings = {
-        "effects": [d.effect for d in plan if d.simulate],
+        "effects": simulated,
         "light_resolution": config.light_resolution,
         "refine": config.refine if shadows else 1,
         "receivers": config.receivers,
         "subdivide": config.subdivide,
         "basis": config.basis,
         "seed": config.seed,
-        "bounces": config.bounces,
+        "bounces": bounces,
     }
+    if bounce_cells:
+        settings["bounce_resolution"] = bounce_cells
     if config.basis == "haar":
         settings |= {"coefficients": config.coefficients, "tolerance": config.tolerance}
     if config.basis == "sh":
@@ -122,6 +134,8 @@ def precompute(config: Config) -> dict[str, Any]:
         if geometry is not source:
             writer.put("source/face", source.faces, dims=("face", "corner"))
         put_receivers(writer, receivers)
+        if bounce_cells and geometry.textures:
+            put_vertex_colours(writer, geometry)
         job = VisibilityJob(
             str(writer.partial_path),
             config.light_resolution,
@@ -133,6 +147,7 @@ def precompute(config: Config) -> dict[str, Any]:
             config.sh_order,
             config.seed,
             tuple(scene.lights.values()),
+            bounce_cells,
         )
         create_outputs(writer, job, len(receivers))
         run.run_blocks(
@@ -166,10 +181,18 @@ def _check(config: Config) -> None:
         raise InputError(f"--tolerance: expected more than 0 and less than 1; found {config.tolerance}")
     if not 1 <= config.sh_order <= 16:
         raise InputError(f"--sh-order: expected 1 to 16; found {config.sh_order}")
-    if config.bounces != 0:
+    if config.bounces is not None and not 0 <= config.bounces <= MOST_BOUNCES:
+        raise InputError(f"--bounces: expected 0 to {MOST_BOUNCES}; found {config.bounces}")
+
+
+def _check_bounces(config: Config) -> None:
+    if config.receivers != "vertices":
+        raise InputError("--receivers pixels: interreflections need vertices to bounce off; use --receivers vertices")
+    cells = config.bounce_resolution
+    if cells not in (8, 16, 32, 64) or config.light_resolution % cells:
         raise InputError(
-            f"--bounces: this version simulates direct light only, expected 0; found {config.bounces} "
-            "(relight --reference traces any number)"
+            "--bounce-resolution: expected 8, 16, 32 or 64, and a divisor of --light-resolution "
+            f"({config.light_resolution}); found {cells}"
         )
 
 
@@ -233,6 +256,7 @@ def _dry_run(
     both: NDArray[np.bool_],
     plan: list[effects.Decision],
     shadows: bool,
+    bounce_cells: int,
 ) -> dict[str, Any]:
     """The plan with its cost, predicted from a pilot of a few hundred receivers.
 
@@ -243,6 +267,7 @@ def _dry_run(
     rays = seconds = packed = 0.0
     if shadows and len(points):
         tracer = Tracer(geometry.positions, geometry.faces)
+        surfaces = surfaces_of(geometry, points) if bounce_cells else None
         starts = np.linspace(0, max(0, len(points) - visibility.GROUP), PILOT_GROUPS + 1).astype(int)
         pilot = 0
         for k, start in enumerate(starts):
@@ -251,11 +276,18 @@ def _dry_run(
             block = visibility.trace_visibility(
                 tracer, points.position[rows], points.normal[rows], config.light_resolution, config.refine, config.seed
             )
+            if surfaces is not None:
+                hits, more = trace_hits(
+                    tracer, surfaces, points.position[rows], points.normal[rows], block.bits, bounce_cells, start, 0
+                )
             if k:  # the first run pays for compilation
                 seconds += time.perf_counter() - clock
                 rays += block.rays
                 pilot += len(block.bits)
                 packed += len(zlib.compress(block.bits.tobytes(), 1))
+                if surfaces is not None:
+                    rays += more
+                    packed += len(zlib.compress(hits.tobytes(), 1))
         rays *= len(points) / pilot
         packed *= len(points) / pilot
         seconds *= len(points) / pilot / max(1, config.workers)

@@ -11,7 +11,9 @@ import relight_formats as formats
 from relightcli.adapters.rays import Tracer
 from relightcli.core.shade import picture, primary
 from relightcli.core.transport.camera import make_film
-from relightcli.core.transport.receivers import Receivers, spatial_order, vertex_receivers
+from relightcli.core.transport.hits import Surfaces
+from relightcli.core.transport.receivers import Receivers, receivers_of_vertices, spatial_order, vertex_receivers
+from relightcli.core.transport.shading import vertex_colours
 from relightcli.errors import InputError
 from relightcli.scene.model import Geometry, Scene
 
@@ -85,6 +87,13 @@ def _pixel_receivers(scene: Scene, name: str, geometry: Geometry) -> PixelReceiv
     )
 
 
+def surfaces_of(geometry: Geometry, points: Receivers) -> Surfaces:
+    """Mesh and receivers as `core.transport.hits` wants them."""
+    front, back = receivers_of_vertices(points.vertex, points.side, len(geometry.positions))
+    two_sided = geometry.two_sided[geometry.face_object]
+    return Surfaces(geometry.positions, geometry.normals, geometry.faces, two_sided, front, back)
+
+
 def put_geometry(writer: formats.Writer, geometry: Geometry) -> None:
     put = writer.put
     put("mesh/position", geometry.positions, dims=("vertex", "axis"), units="m")
@@ -97,6 +106,11 @@ def put_geometry(writer: formats.Writer, geometry: Geometry) -> None:
     put("objects/two_sided", geometry.two_sided, dims=("object",))
     for material, texture in geometry.textures.items():
         put(f"textures/{material}/radiance", texture, dims=("row", "column", "colour"))
+
+
+def put_vertex_colours(writer: formats.Writer, geometry: Geometry) -> None:
+    """The mean of the texture around every vertex, for light that bounces off it."""
+    writer.put("bounce/texture", vertex_colours(geometry), dims=("vertex", "colour"))
 
 
 def put_receivers(writer: formats.Writer, receivers: Receivers | PixelReceivers) -> None:

@@ -27,6 +27,7 @@ from relightcli.stages.lighting import read_scene
 from relightcli.stages.outputs import (
     Config,
     check_shots,
+    layer_names,
     numbered,
     put_picture,
     resolve_camera,
@@ -34,7 +35,6 @@ from relightcli.stages.outputs import (
 )
 from relightcli.stages.shots import Shot
 
-LAYER_NAMES = ("direct", "one_bounce", "two_bounce", "three_bounce", "four_bounce")
 PATHS_PER_BLOCK = 8_000_000
 
 
@@ -61,7 +61,7 @@ class ReferenceJob:
 class ReferenceWorker:
     def __init__(self, job: ReferenceJob) -> None:
         self.job = job
-        scene, geometry, _ = open_source(Path(job.source), job.allow_outside)
+        scene, geometry, _, _ = open_source(Path(job.source), job.allow_outside)
         materials = apply_settings(scene.materials, job.settings)
         self.camera = scene.cameras[job.camera]
         self.scene = shading_scene(geometry, list(materials.values()), scene.lights.values())
@@ -91,20 +91,20 @@ class ReferenceWorker:
         return {"rays": float(tile.rays)}
 
 
-def open_source(path: Path, allow_outside: bool = False) -> tuple[Scene, Geometry, str]:
-    """Scene, geometry and fingerprint of a transfer store, or of a scene file (.toml)."""
+def open_source(path: Path, allow_outside: bool = False) -> tuple[Scene, Geometry, str, int]:
+    """Scene, geometry, fingerprint and interreflections of a transfer store, or of a scene file (.toml; 0)."""
     if path.suffix.lower() == ".toml":
         scene = load_scene(path, allow_outside=allow_outside)
-        return scene, build_geometry(scene), formats.fingerprint_json(scene_inputs(scene))
+        return scene, build_geometry(scene), formats.fingerprint_json(scene_inputs(scene)), 0
     store = formats.open_store(path, "transfer")
-    return *read_scene(store), store.fingerprint
+    return *read_scene(store), store.fingerprint, int(store.settings["bounces"])
 
 
 def render_reference(config: Config, shots: list[Shot], suffix: str, started: float) -> dict[str, Any]:
     """Path-traces every shot. Samples accumulate in `OUTPUT.samples.partial` until the picture is written."""
-    scene, _, fingerprint = open_source(config.store, config.allow_outside)
+    scene, _, fingerprint, own_bounces = open_source(config.store, config.allow_outside)
     check_shots(config, shots, scene)
-    bounces = config.bounces if config.bounces is not None else 0
+    bounces = own_bounces if config.bounces is None else config.bounces
     written, rays = [], 0
     notes: list[str] = []
     for shot in shots:
@@ -169,7 +169,7 @@ def render_reference(config: Config, shots: list[Shot], suffix: str, started: fl
         picture = resolve(tile)
         extra: dict[str, Any] = {}
         if suffix == ".exr":
-            names = [*_layer_names(bounces + 1), *(["background"] if config.background else [])]
+            names = [*layer_names(bounces + 1), *(["background"] if config.background else [])]
             extra = dict(zip(names, picture.layers, strict=True)) if config.layers else {}
             extra["variance"] = picture.variance
         pixels = np.concatenate([picture.beauty, picture.alpha[..., None]], axis=2)
@@ -198,10 +198,6 @@ def render_reference(config: Config, shots: list[Shot], suffix: str, started: fl
         "seconds": time.perf_counter() - started,
         "notes": notes,
     }
-
-
-def _layer_names(count: int) -> list[str]:
-    return [LAYER_NAMES[i] if i < len(LAYER_NAMES) else f"bounce_{i}" for i in range(count)]
 
 
 def _create(writer: formats.Writer, layers: int, height: int, width: int, rows: int) -> None:

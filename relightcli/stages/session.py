@@ -21,10 +21,11 @@ from relightcli.core.transport.camera import film_directions, make_film
 from relightcli.errors import InputError, NumericalError
 from relightcli.scene.model import Camera, Material
 from relightcli.scene.settings import apply_settings
-from relightcli.stages.lighting import LightingStore, Radiance
+from relightcli.stages.lighting import LightingStore, Radiance, together
 from relightcli.stages.outputs import (
     PICTURES,
     Config,
+    layer_names,
     numbered,
     put_picture,
     resolve_camera,
@@ -67,7 +68,7 @@ class Session:
         if self.lighting.scene.cameras:
             eye = np.array(resolve_camera(shot.camera, self.lighting.scene.cameras).eye)
             towards = _towards(eye, self.lighting.position)
-        radiance = self._light(shot, environment, materials, towards, None)
+        radiance = together(self._light(shot, environment, materials, towards, None))
         total = radiance.diffuse if radiance.specular is None else radiance.diffuse + radiance.specular
         if suffix == ".ply":
             return self._write_ply(shot, total)
@@ -91,10 +92,10 @@ class Session:
         materials: dict[str, Material],
         towards: NDArray[np.float32] | None,
         active: NDArray[np.bool_] | None,
-    ) -> Radiance:
+    ) -> list[Radiance]:
         clock = time.perf_counter()
         radiance = self.lighting.exit_radiance(
-            environment, shot.env_rotate, materials, towards, active, self.config.basis
+            environment, shot.env_rotate, materials, towards, active, self.config.basis, self.config.bounces
         )
         self.lighting_seconds += time.perf_counter() - clock
         return radiance
@@ -140,12 +141,19 @@ class Session:
     ) -> str:
         view = self._view(shot.camera)
         width, height = view.camera.size
-        radiance = self._light(shot, environment, materials, view.towards, view.active)
+        parts = self._light(shot, environment, materials, view.towards, view.active)
         threads = self.config.workers
-        rgb = picture.assemble(view.matrix, radiance.diffuse, radiance.specular, threads).reshape(height, width, 3)
+        layers = {}
+        if self.config.layers:
+            for name, part in zip(layer_names(len(parts)), parts, strict=True):
+                flat = picture.assemble(view.matrix, part.diffuse, part.specular, threads)
+                layers[name] = flat.reshape(height, width, 3)
+            rgb = np.sum(list(layers.values()), axis=0)
+        else:
+            total = together(parts)
+            rgb = picture.assemble(view.matrix, total.diffuse, total.specular, threads).reshape(height, width, 3)
         _need_finite(rgb, str(self.config.store))
         alpha = view.coverage
-        layers = {"direct": rgb} if self.config.layers else {}
         if self.config.background:
             behind = environment_behind(environment, shot.env_rotate, view.camera) * (1.0 - alpha[..., None])
             if self.config.layers:
@@ -166,7 +174,7 @@ class Session:
             "relight:env_rotate": float(shot.env_rotate),
             "relight:camera": self._view(shot.camera).camera.name,
             "relight:set": " ".join(shot.settings),
-            "relight:bounces": int(store.settings.get("bounces", 0)),
+            "relight:bounces": self.lighting.bounces if config.bounces is None else config.bounces,
         }
         return put_picture(config, shot, suffix, pixels, layers, metadata)
 
@@ -200,6 +208,7 @@ class Session:
                 "camera": config.camera,
                 "set": list(config.settings),
                 "basis": config.basis,
+                "bounces": config.bounces,
                 "frames": None if config.frames is None else formats.fingerprint_file(config.frames),
             },
             inputs={"store": store.fingerprint, **self._maps},

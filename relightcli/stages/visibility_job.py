@@ -1,4 +1,4 @@
-"""The work of precompute on one block of receivers: trace their visibility, project it on the chosen basis."""
+"""The work of precompute on one block of receivers: their visibility, what blocks it, its projection on a basis."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ import relight_formats as formats
 from relightcli.adapters.rays import Tracer
 from relightcli.core.sphere import cube, haar, sh
 from relightcli.core.transport import visibility
+from relightcli.core.transport.hits import Surfaces, trace_hits
 from relightcli.core.transport.light_visibility import POINTS_PER_LIGHT, light_bits
 from relightcli.core.transport.local_lights import pack_lights
+from relightcli.core.transport.receivers import receivers_of_vertices
 from relightcli.run import blocks as run
 from relightcli.scene.model import RectangleLight, SphereLight
 
@@ -35,6 +37,7 @@ class VisibilityJob:
     sh_order: int
     seed: int
     lights: tuple[SphereLight | RectangleLight, ...]
+    bounce_cells: int  # cells along a side of the cube of what is seen; 0: no interreflections
 
     def open(self) -> VisibilityWorker:
         return VisibilityWorker(self)
@@ -51,6 +54,7 @@ class VisibilityWorker:
         self.tracer = Tracer(array("mesh/position")[:], array("mesh/face")[:]) if job.shadows else None
         self.out = {name: array(name) for name in _outputs(job)}
         self.lights = pack_lights(job.lights)
+        self.surfaces = _surfaces(array) if job.bounce_cells else None
         self.directions = cube.texel_directions(job.resolution).reshape(-1, 3).astype(np.float32)
         self.solid_angle = cube.solid_angles(job.resolution).reshape(-1).astype(np.float32)
 
@@ -78,6 +82,13 @@ class VisibilityWorker:
             info["rays"] += float(rays)
         info["trace_seconds"] = time.perf_counter() - start
         self.out["visibility/bits"][rows] = bits
+        if self.surfaces is not None and self.tracer is not None:
+            start = time.perf_counter()
+            self.out["bounce/hit"][rows], rays = trace_hits(
+                self.tracer, self.surfaces, position, normal, bits, job.bounce_cells, block.start, job.seed
+            )
+            info |= {"bounce_rays": float(rays), "bounce_seconds": time.perf_counter() - start}
+            info["rays"] += float(rays)
         if job.basis == "sh":
             self.out["direct/sh"][rows] = sh.cosine_transfer(bits, normal, job.sh_order)
         elif job.basis == "haar":
@@ -92,6 +103,14 @@ class VisibilityWorker:
         return info
 
 
+def _surfaces(array: Any) -> Surfaces:
+    """Mesh and receivers of the unfinished store, as `trace_hits` wants them; `array` opens one by name."""
+    position = array("mesh/position")[:]
+    front, back = receivers_of_vertices(array("receivers/vertex")[:], array("receivers/side")[:], len(position))
+    two_sided = array("objects/two_sided")[:][array("mesh/face_object")[:]]
+    return Surfaces(position, array("mesh/normal")[:], array("mesh/face")[:], two_sided, front, back)
+
+
 def _dense(
     bits: NDArray[np.uint8],
     normal: NDArray[np.float32],
@@ -100,14 +119,18 @@ def _dense(
 ) -> NDArray[np.float32]:
     seen = np.unpackbits(bits.reshape(len(bits), -1), axis=1, bitorder="little")
     weights = np.tile(solid_angle, 6) / np.float32(np.pi)
-    out: NDArray[np.float32] = np.maximum(normal @ directions.T, 0.0) * weights * seen
+    # Spelled out: the bytes of a matrix product depend on the library's threads.
+    height = sum(normal[:, x, None] * directions[:, x] for x in range(3))
+    out: NDArray[np.float32] = np.maximum(height, 0.0) * weights * seen
     return out
 
 
 def _outputs(job: VisibilityJob) -> list[str]:
     more = {"visibility": [], "sh": ["direct/sh"], "dense": ["direct/dense"]}
     more["haar"] = ["direct/haar_index", "direct/haar_value"]
-    return ["visibility/bits", *more[job.basis], *(["lights/bits"] if job.lights else [])]
+    lights = ["lights/bits"] if job.lights else []
+    bounce = ["bounce/hit"] if job.bounce_cells else []
+    return ["visibility/bits", *more[job.basis], *lights, *bounce]
 
 
 def block_size(resolution: int) -> int:
@@ -145,6 +168,16 @@ def create_outputs(writer: formats.Writer, job: VisibilityJob, count: int) -> No
         attrs={"bit_order": "little", "description": "1 where the texel's centre is above the horizon and unblocked"},
         codec="zstd",
     )
+    if job.bounce_cells:
+        c = job.bounce_cells
+        writer.array(
+            "bounce/hit",
+            shape=(count, 6, c, c),
+            dtype=np.int32,
+            chunks=(size, 6, c, c),
+            dims=("receiver", "cube_face", "cell_row", "cell_column"),
+            attrs={"description": "1 + the receiver seen through the blocked part of the cell; 0: nothing that shines"},
+        )
     if job.basis == "sh":
         n = job.sh_order**2
         writer.array("direct/sh", shape=(count, n), dtype=np.float32, chunks=(size, n), dims=("receiver", "harmonic"))

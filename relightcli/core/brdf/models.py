@@ -92,13 +92,6 @@ def pack_materials(materials: Iterable[MaterialLike]) -> MaterialTable:
         code = MODEL_CODES[material.model]
         roughness = max(float(material.roughness), MINIMUM_ROUGHNESS)
         a = float(material.shininess)
-        normalisation = 0.0
-        if code == BLINN_PHONG:
-            normalisation = (a + 2.0) * (a + 4.0) / (8.0 * math.pi * (2.0 ** (-0.5 * a) + a))
-        elif code == COOK_TORRANCE:
-            normalisation = 1.0 / (math.pi * roughness * roughness)
-        elif code == PHONG:
-            normalisation = (a + 1.0) / (2.0 * math.pi)
         codes.append(code)
         rows.append(
             [
@@ -108,10 +101,36 @@ def pack_materials(materials: Iterable[MaterialLike]) -> MaterialTable:
                 float(material.f0),
                 roughness,
                 a,
-                normalisation,
+                _normalisation(code, roughness, a),
             ]
         )
     return MaterialTable(np.array(codes, np.int32), np.array(rows, np.float64).reshape(len(codes), PARAMETERS))
+
+
+def _normalisation(code: int, roughness: float, a: float) -> float:
+    """The constant in front of a specular lobe; 0 for a model without one."""
+    if code == BLINN_PHONG:
+        return (a + 2.0) * (a + 4.0) / (8.0 * math.pi * (2.0 ** (-0.5 * a) + a))
+    if code == COOK_TORRANCE:
+        return 1.0 / (math.pi * roughness * roughness)
+    if code == PHONG:
+        return (a + 1.0) / (2.0 * math.pi)
+    return 0.0
+
+
+def widen(table: MaterialTable, width: float) -> MaterialTable:
+    """The table with specular lobes at least about `width` radians wide, in directions of light.
+
+    Roughness is at least width / sqrt 2; exponents are at most 4 / width^2 about the half-vector, 1 / width^2 about the
+    mirror direction: the standard deviation of the lobe is then `width`.
+    """
+    rows = table.parameters.copy()
+    rows[:, ROUGHNESS] = np.maximum(rows[:, ROUGHNESS], width / math.sqrt(2.0))
+    half = np.where(table.model == PHONG, 1.0, 4.0)
+    rows[:, SHININESS] = np.minimum(rows[:, SHININESS], half / width**2)
+    for code, row in zip(table.model, rows, strict=True):
+        row[NORMALISATION] = _normalisation(int(code), row[ROUGHNESS], row[SHININESS])
+    return MaterialTable(table.model, rows)
 
 
 @njit(cache=True, error_model="numpy")

@@ -10,14 +10,12 @@ from __future__ import annotations
 import itertools
 import math
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import numpy as np
-from llvmlite import ir
-from numba import njit, types
-from numba.extending import intrinsic
+from numba import njit
 from numpy.typing import NDArray
 
+from relightcli.core.bits import trailing_zeros
 from relightcli.core.lights.environment import SkyCube
 
 
@@ -59,16 +57,6 @@ def irradiance(
     return out
 
 
-@intrinsic
-def _trailing_zeros(typing_context: Any, word: Any) -> Any:
-    """Index of the lowest set bit of a uint64 that is not zero: the processor's own instruction."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
-
-    return types.int64(types.uint64), generate
-
-
 @njit(cache=True, nogil=True)
 def _sum_runs(words, normals, active, prefix, out):  # type: ignore[no-untyped-def]
     one = np.uint64(1)
@@ -87,12 +75,11 @@ def _sum_runs(words, normals, active, prefix, out):  # type: ignore[no-untyped-d
             change = word ^ ((word << one) | carry)
             carry = word >> top
             while change != zero:
-                low = change & (~change + one)
-                at = 64 * w + _trailing_zeros(low)  # type: ignore[call-arg]
+                at = 64 * w + trailing_zeros(change)  # type: ignore[call-arg]
                 for q in range(9):
                     acc[q] += sign * prefix[at, q]
                 sign = -sign
-                change ^= low
+                change &= change - one
         if sign > 0.0:  # a run that reaches the last texel
             for q in range(9):
                 acc[q] += prefix[prefix.shape[0] - 1, q]

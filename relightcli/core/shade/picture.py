@@ -10,8 +10,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.shade.primary import Samples
-from relightcli.core.transport.shading import Surface, shading_scene, surface_at
-from relightcli.scene.model import Geometry, Material
+from relightcli.core.transport.shading import Surface, surface_at, white_scene
+from relightcli.scene.model import Geometry
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,9 @@ class PixelMatrix:
 
 def lit_surface(geometry: Geometry, samples: Samples) -> Surface:
     """The surface at those samples that can send light to the camera; `path` is the sample, `albedo` the texture."""
-    # White materials: what comes back as albedo is the texture alone.
-    scene = shading_scene(geometry, [Material("", diffuse=(1.0, 1.0, 1.0))] * (int(geometry.material.max()) + 1))
     n = len(samples.face)
     return surface_at(
-        scene,
+        white_scene(geometry),
         samples.face,
         samples.u,
         samples.v,

@@ -5,12 +5,17 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
+from relightcli.core.bits import trailing_zeros
 from relightcli.core.sphere import cube
+
+SLAB_BYTES = 32 << 20
 
 
 def harmonics(directions: NDArray[np.float64], order: int) -> NDArray[np.float64]:
@@ -36,11 +41,55 @@ def cosine_transfer(bits: NDArray[np.uint8], normals: NDArray[np.float32], order
 
     bits (N, 6, R, R/8) visibility (zero below the horizon), normals (N, 3). The dot product with the sky's
     coefficients is the exit radiance of a white Lambert surface, up to the bands left out.
+
+    Runs of visible texels are taken from running sums, in a fixed order: the bytes of the result depend neither on how
+    receivers are put into blocks nor on the threads of a linear algebra library.
     """
     resolution = bits.shape[2]
-    seen = np.unpackbits(bits.reshape(len(bits), -1), axis=1, bitorder="little").astype(np.float32)
-    moments = (seen @ _moment_basis(resolution, order)).reshape(len(bits), 3, order * order)
-    out: NDArray[np.float32] = np.einsum("nxi,nx->ni", moments, normals) / np.float32(np.pi)
+    words = np.ascontiguousarray(bits).reshape(len(bits), -1).view(np.uint64)
+    basis = _moment_basis(resolution, order)
+    moments = np.zeros((len(bits), basis.shape[1]))
+    slab = max(1, SLAB_BYTES // (64 * 8 * basis.shape[1]))  # words, so that their running sums stay small
+    for first in range(0, words.shape[1], slab):
+        part = basis[64 * first : 64 * (first + slab)]
+        prefix = np.zeros((len(part) + 1, basis.shape[1]))
+        np.cumsum(part, axis=0, dtype=np.float64, out=prefix[1:])
+        _add_runs(words[:, first : first + slab], prefix, moments)
+    return _along(moments.reshape(len(bits), 3, order * order), np.ascontiguousarray(normals, np.float32))
+
+
+@njit(cache=True)
+def _add_runs(words, prefix, out):  # type: ignore[no-untyped-def]
+    one, zero = np.uint64(1), np.uint64(0)
+    for i in range(words.shape[0]):
+        carry = zero  # last bit of the word before
+        is_open = False
+        for w in range(words.shape[1]):
+            word = words[i, w]
+            change = word ^ ((word << one) | carry)
+            carry = word >> np.uint64(63)
+            while change != zero:
+                at = 64 * w + trailing_zeros(change)  # type: ignore[call-arg]
+                if is_open:
+                    out[i] += prefix[at]
+                else:
+                    out[i] -= prefix[at]
+                is_open = not is_open
+                change &= change - one
+        if is_open:
+            out[i] += prefix[len(prefix) - 1]
+
+
+@njit(cache=True)
+def _along(moments, normals):  # type: ignore[no-untyped-def]
+    """Moments (N, 3, S) along the normals (N, 3), over pi: (N, S) float32."""
+    out = np.empty((moments.shape[0], moments.shape[2]), np.float32)
+    for i in range(len(out)):
+        for k in range(out.shape[1]):
+            total = 0.0
+            for x in range(3):
+                total += moments[i, x, k] * normals[i, x]
+            out[i, k] = total / math.pi
     return out
 
 

@@ -11,8 +11,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.brdf.models import DIFFUSE, Triple, pack_materials
+from relightcli.core.sphere.lattice import r2_point
 from relightcli.core.transport.local_lights import LocalLights, pack_lights
 from relightcli.scene.model import Geometry, Material, RectangleLight, SphereLight
+
+TEXTURE_POINTS = 32  # of every textured face
 
 
 class ShadingScene(NamedTuple):
@@ -82,6 +85,56 @@ def shading_scene(
         np.concatenate(texels),
         pack_lights(lights),
     )
+
+
+def white_scene(geometry: Geometry) -> ShadingScene:
+    """The scene in white: what comes back as albedo is the texture alone."""
+    return shading_scene(geometry, [Material("", diffuse=(1.0, 1.0, 1.0))] * (int(geometry.material.max()) + 1))
+
+
+def vertex_colours(geometry: Geometry) -> NDArray[np.float32]:
+    """Mean texture around every vertex, (V, 3) float32, 1 where there is none.
+
+    The mean is over the faces at the vertex, weighted by its barycentric coordinate: interpolating the vertices'
+    colours keeps the texture's integral over every object.
+    """
+    out = np.zeros((len(geometry.positions), 4))
+    _add_texture(white_scene(geometry), TEXTURE_POINTS, out)
+    weight = out[:, 3:]
+    colours: NDArray[np.float64] = np.divide(out[:, :3], weight, out=np.ones((len(out), 3)), where=weight > 0)
+    return colours.astype(np.float32)
+
+
+@njit(cache=True, error_model="numpy")
+def _add_texture(scene: ShadingScene, points: int, out: Any) -> None:
+    """Adds texture times weight and weight of evenly spread points of every textured face to its corners."""
+    p = scene.positions
+    for f in range(len(scene.faces)):
+        material = scene.face_material[f]
+        first, height, width = scene.texture[material]
+        if first < 0:
+            continue
+        a, b, c = scene.faces[f]
+        e1, e2 = p[b] - p[a], p[c] - p[a]
+        area = math.sqrt(
+            (e1[1] * e2[2] - e1[2] * e2[1]) ** 2
+            + (e1[2] * e2[0] - e1[0] * e2[2]) ** 2
+            + (e1[0] * e2[1] - e1[1] * e2[0]) ** 2
+        )
+        for k in range(points):
+            u, v = r2_point(k)
+            if u + v > 1.0:
+                u, v = 1.0 - u, 1.0 - v
+            w = 1.0 - u - v
+            s = w * scene.uvs[a, 0] + u * scene.uvs[b, 0] + v * scene.uvs[c, 0]
+            t = w * scene.uvs[a, 1] + u * scene.uvs[b, 1] + v * scene.uvs[c, 1]
+            if not (math.isfinite(s) and math.isfinite(t)):
+                continue
+            colour = bilinear(scene.texels, first, height, width, s, t)
+            for corner, share in ((a, w * area), (b, u * area), (c, v * area)):
+                for x in range(3):
+                    out[corner, x] += share * colour[x]
+                out[corner, 3] += share
 
 
 @njit(cache=True, error_model="numpy")
