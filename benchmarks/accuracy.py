@@ -59,7 +59,7 @@ def light(store: Path, skies: list[Sky]) -> tuple[list[NDArray[np.float32]], flo
     materials = lighting.scene.materials
 
     def relight(sky: Sky, rotate: float) -> NDArray[np.float32]:
-        return lighting.exit_radiance(sky, rotate, materials, None).diffuse
+        return lighting.exit_radiance(sky, rotate, materials, None)[0].diffuse
 
     found = [relight(sky, 0.0) for sky in skies]  # reads, compiles
     seconds = []

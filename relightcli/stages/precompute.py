@@ -34,6 +34,7 @@ from relightcli.stages.receiver_setup import (
     put_receivers,
     put_vertex_colours,
     surfaces_of,
+    unburied,
 )
 from relightcli.stages.visibility_job import VisibilityJob, block_size, create_outputs
 
@@ -133,7 +134,12 @@ def precompute(config: Config) -> dict[str, Any]:
         put_geometry(writer, geometry)
         if geometry is not source:
             writer.put("source/face", source.faces, dims=("face", "corner"))
-        put_receivers(writer, receivers)
+        buried = None
+        if isinstance(receivers, Receivers):
+            buried = np.zeros(len(receivers), bool)
+            if shadows:
+                receivers, buried = unburied(geometry, receivers)
+        put_receivers(writer, receivers, buried)
         if bounce_cells and geometry.textures:
             put_vertex_colours(writer, geometry)
         job = VisibilityJob(
@@ -267,7 +273,7 @@ def _dry_run(
     rays = seconds = packed = 0.0
     if shadows and len(points):
         tracer = Tracer(geometry.positions, geometry.faces)
-        surfaces = surfaces_of(geometry, points) if bounce_cells else None
+        surfaces = surfaces_of(geometry, points, np.zeros(len(points), bool)) if bounce_cells else None
         starts = np.linspace(0, max(0, len(points) - visibility.GROUP), PILOT_GROUPS + 1).astype(int)
         pilot = 0
         for k, start in enumerate(starts):

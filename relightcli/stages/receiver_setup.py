@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 import relight_formats as formats
 from relightcli.adapters.rays import Tracer
 from relightcli.core.shade import picture, primary
+from relightcli.core.transport.buried import unbury
 from relightcli.core.transport.camera import make_film
 from relightcli.core.transport.hits import Surfaces
 from relightcli.core.transport.receivers import Receivers, receivers_of_vertices, spatial_order, vertex_receivers
@@ -87,11 +88,23 @@ def _pixel_receivers(scene: Scene, name: str, geometry: Geometry) -> PixelReceiv
     )
 
 
-def surfaces_of(geometry: Geometry, points: Receivers) -> Surfaces:
+def surfaces_of(geometry: Geometry, points: Receivers, buried: NDArray[np.bool_]) -> Surfaces:
     """Mesh and receivers as `core.transport.hits` wants them."""
     front, back = receivers_of_vertices(points.vertex, points.side, len(geometry.positions))
     two_sided = geometry.two_sided[geometry.face_object]
-    return Surfaces(geometry.positions, geometry.normals, geometry.faces, two_sided, front, back)
+    return Surfaces(geometry.positions, geometry.normals, geometry.faces, two_sided, front, back, buried)
+
+
+def unburied(geometry: Geometry, points: Receivers) -> tuple[Receivers, NDArray[np.bool_]]:
+    """Vertex receivers, those that nothing can see moved to where something can; and which are left, (N,) bool."""
+    return unbury(
+        Tracer(geometry.positions, geometry.faces),
+        points,
+        geometry.positions,
+        geometry.faces,
+        primary.face_normals(geometry.positions, geometry.faces),
+        geometry.two_sided[geometry.face_object],
+    )
 
 
 def put_geometry(writer: formats.Writer, geometry: Geometry) -> None:
@@ -113,7 +126,10 @@ def put_vertex_colours(writer: formats.Writer, geometry: Geometry) -> None:
     writer.put("bounce/texture", vertex_colours(geometry), dims=("vertex", "colour"))
 
 
-def put_receivers(writer: formats.Writer, receivers: Receivers | PixelReceivers) -> None:
+def put_receivers(
+    writer: formats.Writer, receivers: Receivers | PixelReceivers, buried: NDArray[np.bool_] | None
+) -> None:
+    """`buried` (N,) belongs to vertex receivers."""
     points = receivers.points if isinstance(receivers, PixelReceivers) else receivers
     put = writer.put
     put("receivers/position", points.position, dims=("receiver", "axis"), units="m")
@@ -128,3 +144,4 @@ def put_receivers(writer: formats.Writer, receivers: Receivers | PixelReceivers)
         put("picture/coverage", receivers.coverage, dims=("row", "column"))
     else:
         put("receivers/vertex", points.vertex, dims=("receiver",))
+        put("receivers/buried", buried, dims=("receiver",))

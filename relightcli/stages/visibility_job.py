@@ -108,7 +108,8 @@ def _surfaces(array: Any) -> Surfaces:
     position = array("mesh/position")[:]
     front, back = receivers_of_vertices(array("receivers/vertex")[:], array("receivers/side")[:], len(position))
     two_sided = array("objects/two_sided")[:][array("mesh/face_object")[:]]
-    return Surfaces(position, array("mesh/normal")[:], array("mesh/face")[:], two_sided, front, back)
+    buried = array("receivers/buried")[:]
+    return Surfaces(position, array("mesh/normal")[:], array("mesh/face")[:], two_sided, front, back, buried)
 
 
 def _dense(

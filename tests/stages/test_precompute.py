@@ -239,8 +239,8 @@ def test_bases_against_visibility(scene, tmp_path):
         made = make_store(scene, f"{tmp_path}/{basis}.zarr", basis=basis, light_resolution=16, refine=2, **more)
         store = LightingStore(made, 1)
         white = {name: Material(name, diffuse=(1.0, 1.0, 1.0)) for name in store.scene.materials}
-        radiance[basis] = store.exit_radiance(environment, 30.0, white, None).diffuse
-        radiance["visibility"] = store.exit_radiance(environment, 30.0, white, None, basis="visibility").diffuse
+        radiance[basis] = store.exit_radiance(environment, 30.0, white, None)[0].diffuse
+        radiance["visibility"] = store.exit_radiance(environment, 30.0, white, None, basis="visibility")[0].diffuse
     np.testing.assert_allclose(radiance["haar"], radiance["dense"], rtol=2e-5)
     # Texels' own centres against the light's mean direction, and the bilinear sharing: 1/16 of a texel's change.
     scale = radiance["visibility"].max()
@@ -257,7 +257,7 @@ def test_haar_error_falls_with_the_coefficients(scene, tmp_path):
         output = f"{tmp_path}/{count}.zarr"
         made = make_store(scene, output, basis="haar", coefficients=count, light_resolution=16, refine=2)
         store = LightingStore(made, 1)
-        diffuse = store.exit_radiance(environment, 0.0, store.scene.materials, None).diffuse
+        diffuse = store.exit_radiance(environment, 0.0, store.scene.materials, None)[0].diffuse
         exact = diffuse if exact is None else exact
         errors.append(float(np.sqrt(((diffuse - exact) ** 2).mean() / (exact**2).mean())))
     assert errors == sorted(errors)

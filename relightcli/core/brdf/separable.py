@@ -28,7 +28,7 @@ MOST_ORDERS = AZIMUTHS // 2
 
 
 class Separable(NamedTuple):
-    """Terms, sorted by order: order (K,) int64; view_factor and light_factor at p = (g + 1/2)/POLAR, (POLAR, K) float32.
+    """Terms, sorted by order: order (K,) int64; view_factor, light_factor (POLAR, K) float32 at p = (g + 1/2)/POLAR.
     The lobe is the sum over k of view_factor light_factor cos(order phi), sr^-1."""
 
     order: NDArray[np.int64]

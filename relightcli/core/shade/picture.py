@@ -54,9 +54,11 @@ def vertex_matrix(
     face_normals: NDArray[np.float32],
     front: NDArray[np.int32],
     back: NDArray[np.int32],
+    buried: NDArray[np.bool_],
     pixels: int,
 ) -> PixelMatrix:
-    """Weights of the three corners' receivers at every sample. front, back (V,): receiver of a vertex's side, or -1."""
+    """Weights of the three corners' receivers at every sample. front, back (V,): receiver of a vertex's side, or -1;
+    buried (N,): receivers that the face's others stand in for."""
     seen = lit_surface(geometry, samples)
     sample = seen.path
     face = samples.face[sample]
@@ -65,7 +67,10 @@ def vertex_matrix(
     facing = np.einsum("nx,nx->n", face_normals[face], seen.geometric) > 0
     receiver = np.where(facing[:, None], front[corner], back[corner])
     u, v = samples.u[sample], samples.v[sample]
-    weight = np.stack([1.0 - u - v, u, v], axis=1) * samples.weight[sample, None]
+    weight = np.stack([1.0 - u - v, u, v], axis=1)
+    kept = np.where(buried[receiver], 0.0, weight)
+    total = kept.sum(axis=1, keepdims=True)
+    weight = np.where(total > 0, kept / np.where(total > 0, total, 1.0), weight) * samples.weight[sample, None]
     texture = np.zeros((0, 3), np.float32)
     if geometry.textures:
         texture = np.repeat(seen.albedo.astype(np.float32), 3, axis=0)

@@ -43,6 +43,7 @@ class Surfaces(NamedTuple):
 
     positions (V, 3) float64; normals (V, 3) float32; faces (F, 3) int32; two_sided (F,) bool;
     front, back (V,) int32: receiver on either side of a vertex, -1 where there is none
+    buried (N,) bool: receivers that the others of their face stand in for
     """
 
     positions: NDArray[np.float64]
@@ -51,6 +52,7 @@ class Surfaces(NamedTuple):
     two_sided: NDArray[np.bool_]
     front: NDArray[np.int32]
     back: NDArray[np.int32]
+    buried: NDArray[np.bool_]
 
 
 def trace_hits(
@@ -153,6 +155,11 @@ def _keep(surfaces, face, u, v, towards, owner, cell, first, seed, out):  # type
             looking -= (w * q[a, k] + s * q[b, k] + t * q[c, k]) * towards[r, k]
         if not side * looking > 0.0:
             continue
-        x = (_hash(seed, first + owner[r], cell[r], 1) >> np.uint64(11)) * 2.0**-53
-        corner = a if x < w else (b if x < w + s else c)
-        out[owner[r], cell[r]] = (surfaces.front[corner] if side > 0.0 else surfaces.back[corner]) + 1
+        of_vertex = surfaces.front if side > 0.0 else surfaces.back
+        i, j, k = of_vertex[a], of_vertex[b], of_vertex[c]
+        if surfaces.buried[i] + surfaces.buried[j] + surfaces.buried[k] < 3:
+            w = 0.0 if surfaces.buried[i] else w
+            s = 0.0 if surfaces.buried[j] else s
+            t = 0.0 if surfaces.buried[k] else t
+        x = (_hash(seed, first + owner[r], cell[r], 1) >> np.uint64(11)) * 2.0**-53 * (w + s + t)
+        out[owner[r], cell[r]] = (i if x < w else (j if x < w + s else k)) + 1

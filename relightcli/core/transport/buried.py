@@ -1,0 +1,138 @@
+"""Receivers that no camera can see, under a thing that stands on them or inside it, and where they go.
+
+A floor's vertex below a table's foot gets no light; interpolated, it would darken the floor around the foot. Such a
+receiver is found by a few rays: it is buried if none of them leaves the scene, and either each ends closer than the
+receiver's neighbours on the mesh or on the back of a one-sided surface, or most of them end on backs, inside something.
+It moves along its vertex's faces to the nearest place that is not buried, and speaks for the vertex from there. Where
+there is none, the face's other corners stand in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relightcli.core.sphere.lattice import r2_point
+from relightcli.core.transport.receivers import Receivers
+
+FIRST, ALL = 8, 56  # rays of every receiver, and of those whose first ones all end on something
+INSIDE = 0.5  # share of rays that end on backs, from which a point counts as inside
+STEPS = (1 / 16, 2 / 16, 3 / 16, 4 / 16, 6 / 16, 8 / 16, 12 / 16, 15 / 16)  # of the way to a face's opposite edge
+BATCH = 1 << 16
+
+
+class Hits(Protocol):
+    @property
+    def face(self) -> NDArray[np.int32]: ...
+    @property
+    def distance(self) -> NDArray[np.float32]: ...
+
+
+class NearestTracer(Protocol):
+    """What this module needs of a ray tracer."""
+
+    scale: float
+
+    def offset(self, points: NDArray[np.floating[Any]], normals: NDArray[np.floating[Any]]) -> NDArray[np.float32]: ...
+
+    def intersect(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> Hits: ...
+
+
+def unbury(
+    tracer: NearestTracer,
+    receivers: Receivers,
+    positions: NDArray[np.float64],
+    faces: NDArray[np.int32],
+    face_normals: NDArray[np.float32],
+    two_sided: NDArray[np.bool_],
+) -> tuple[Receivers, NDArray[np.bool_]]:
+    """The receivers of a mesh's vertices, buried ones moved; and which of them are buried still, (N,) bool.
+
+    positions (V, 3), faces (F, 3); face_normals (F, 3) of the counter-clockwise sides; two_sided (F,).
+    """
+    reach = _edge_lengths(positions, faces)[receivers.vertex]
+    place = receivers.position.copy()
+    buried = find_buried(tracer, place, receivers.normal, reach, face_normals, two_sided)
+    # Pairs of a buried receiver and one of its faces, by receiver.
+    corner = np.argsort(faces.reshape(-1), kind="stable")
+    first = np.searchsorted(faces.reshape(-1)[corner], np.arange(len(positions) + 1))
+    for step in STEPS:
+        left = np.flatnonzero(buried)
+        vertex = receivers.vertex[left]
+        count = first[vertex + 1] - first[vertex]
+        who = np.repeat(left, count)
+        if len(who) == 0:
+            break
+        within = np.arange(len(who)) - np.repeat(np.cumsum(count) - count, count)
+        at = corner[np.repeat(first[vertex], count) + within]
+        face, k = at // 3, at % 3
+        here = positions[faces[face, k]]
+        across = 0.5 * (positions[faces[face, (k + 1) % 3]] + positions[faces[face, (k + 2) % 3]])
+        there = here + step * (across - here)
+        free = ~find_buried(tracer, there, receivers.normal[who], reach[who], face_normals, two_sided)
+        moved, chosen = np.unique(who[free], return_index=True)
+        place[moved] = there[free][chosen]
+        buried[moved] = False
+    return replace(receivers, position=place), buried
+
+
+def find_buried(
+    tracer: NearestTracer,
+    positions: NDArray[np.float64],
+    normals: NDArray[np.float32],
+    reach: NDArray[np.float64],
+    face_normals: NDArray[np.float32],
+    two_sided: NDArray[np.bool_],
+) -> NDArray[np.bool_]:
+    """Which points (N,) are buried. positions, normals (N, 3); reach (N,), the distance to their neighbours."""
+    buried = np.ones(len(positions), bool)
+    for first, last in ((0, FIRST), (FIRST, ALL)):
+        index = np.flatnonzero(buried)
+        step = max(1, BATCH // (last - first))
+        for start in range(0, len(index), step):
+            rows = index[start : start + step]
+            directions = _directions(normals[rows], first, last)
+            origins = np.repeat(tracer.offset(positions[rows], normals[rows]), last - first, axis=0)
+            hits = tracer.intersect(origins, directions)
+            enclosed = (hits.face >= 0).reshape(len(rows), -1).all(axis=1)
+            if first:
+                near = (hits.distance < np.repeat(reach[rows] * tracer.scale, last - first)).reshape(len(rows), -1)
+                facing = np.einsum("nx,nx->n", face_normals[hits.face], directions)
+                inside = ((facing > 0) & ~two_sided[hits.face]).reshape(len(rows), -1)
+                enclosed &= (near | inside).all(axis=1) | (inside.mean(axis=1) > INSIDE)
+            buried[rows] = enclosed
+    return buried
+
+
+def _directions(normals: NDArray[np.float32], first: int, last: int) -> NDArray[np.float32]:
+    """Directions `first` to `last` of a fixed set about every normal, distributed as the cosine, (N * count, 3)."""
+    points = np.array([r2_point(k) for k in range(first, last)])
+    radius, angle = np.sqrt(points[:, 0]), 2.0 * np.pi * points[:, 1]
+    x, y, z = radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1.0 - points[:, 0])
+    s, t = _tangents(normals.astype(np.float64))
+    out = x[None, :, None] * s[:, None] + y[None, :, None] * t[:, None] + z[None, :, None] * normals[:, None, :]
+    return np.ascontiguousarray(out.reshape(-1, 3), np.float32)
+
+
+def _tangents(n: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Two unit vectors (N, 3) each that complete unit normals (N, 3) to right-handed frames. [Duff 2017, listing 3]"""
+    sign = np.copysign(1.0, n[:, 2])
+    a = -1.0 / (sign + n[:, 2])
+    b = n[:, 0] * n[:, 1] * a
+    s = np.stack([1.0 + sign * n[:, 0] ** 2 * a, sign * b, -sign * n[:, 0]], axis=1)
+    t = np.stack([b, sign + n[:, 1] ** 2 * a, -n[:, 1]], axis=1)
+    return s, t
+
+
+def _edge_lengths(positions: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Mean length of the edges at every vertex, (V,); 0 where there are none."""
+    total, count = np.zeros(len(positions)), np.zeros(len(positions))
+    for a, b in ((0, 1), (1, 2), (2, 0)):
+        length = np.linalg.norm(positions[faces[:, a]] - positions[faces[:, b]], axis=1)
+        for corner in (a, b):
+            total += np.bincount(faces[:, corner], length, len(positions))
+            count += np.bincount(faces[:, corner], minlength=len(positions))
+    return total / np.maximum(count, 1.0)
