@@ -21,7 +21,13 @@ from relightcli.cli import options
 @click.option("--env", default=None, help="Latitude-longitude map, or the name of an environment of the scene.")
 @click.option("--env-rotate", default=0.0, help="Turn the environment about +Y, degrees, right-handed.")
 @click.option("--camera", default=None, help="Camera of the scene. Default: its first.")
-@click.option("--set", "settings", multiple=True, metavar="MATERIAL.PARAMETER=VALUE", help="Change a material.")
+@click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="MATERIAL[.PARAMETER]=VALUE",
+    help="Change a parameter of a material, or (MATERIAL=NAME) make it a measured one.",
+)
 @click.option("--frames", default=None, type=options.PATH, help="Keyframes (TOML); output name with ####.")
 @click.option("--layers", is_flag=True, help="Write the parts of the picture as EXR layers.")
 @click.option("--background", type=click.Choice(["none", "env"]), default="none", help="What misses show.")

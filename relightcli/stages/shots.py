@@ -9,13 +9,14 @@
     camera = "main"                 # holds until the next
     env_rotate = 0                  # degrees; this and everything below is interpolated linearly between keys
     exposure = 0
-    set = { "gold.roughness" = 0.2, "red.diffuse" = [0.6, 0.1, 0.1] }
+    set = { "gold.roughness" = 0.2, "red.diffuse" = [0.6, 0.1, 0.1], "floor" = "blue-acrylic" }
 
     [[key]]
     frame = 25                      # keys may lie beyond the last frame: a full turn in 24 frames without a double
     env_rotate = 360
 
-Before a value's first key it has that key's value, after its last key that one's.
+Before a value's first key it has that key's value, after its last key that one's. A measured material (a text in `set`)
+holds until the next one of the same material; numbers change it further, whichever stands first.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from typing import Any
 
 from relightcli.errors import InputError
 from relightcli.scene.fields import describe, is_number
+from relightcli.scene.settings import measured_fit
 
 MOST_FRAMES = 100_000
 STEPPED = ("env", "camera")
@@ -78,13 +80,26 @@ def read_shots(path: Path, default: Shot) -> list[Shot]:
         if not isinstance(changes, dict):
             raise InputError(f"{path}: {where}.set: expected a table; found {changes!r}")
         for name, value in changes.items():
-            values = value if isinstance(value, list) else [value]
-            numbers = tuple(_number(path, f"{where}.set.{name}", v) for v in values)
-            track = tracks.setdefault(f"set.{name}", [])
-            if track and len(track[0][1]) != len(numbers):
-                raise InputError(f"{path}: {where}.set.{name}: expected {len(track[0][1])} numbers; found {value!r}")
-            track.append((frame, numbers))
+            _add_setting(path, f"{where}.set.{name}", tracks.setdefault(f"set.{name}", []), frame, value)
     return [_shot(path, first + i, tracks, default) for i in range(count)]
+
+
+def _add_setting(path: Path, where: str, track: list[tuple[float, Any]], frame: float, value: Any) -> None:
+    """Appends numbers, or a measured material's name, to the track of one setting, which is all one or the other."""
+    if isinstance(value, str):
+        if track and not _is_text(track):
+            raise InputError(f"{path}: {where}: expected a number, as in the key before; found {value!r}")
+        try:
+            track.append((frame, measured_fit(value).name))
+        except InputError as error:
+            raise InputError(f"{path}: {where}: {error}") from None
+        return
+    numbers = tuple(_number(path, where, v) for v in (value if isinstance(value, list) else [value]))
+    if track and _is_text(track):
+        raise InputError(f"{path}: {where}: expected a measured material, as in the key before; found {value!r}")
+    if track and len(track[0][1]) != len(numbers):
+        raise InputError(f"{path}: {where}: expected {len(track[0][1])} numbers; found {value!r}")
+    track.append((frame, numbers))
 
 
 def _shot(path: Path, number: int, tracks: dict[str, list[tuple[float, Any]]], default: Shot) -> Shot:
@@ -93,10 +108,13 @@ def _shot(path: Path, number: int, tracks: dict[str, list[tuple[float, Any]]], d
         env = str(path.parent / env)
     rotate = _between(tracks.get("env_rotate"), number)
     exposure = _between(tracks.get("exposure"), number)
-    settings = [
-        f"{name.removeprefix('set.')}={','.join(repr(v) for v in _between(track, number) or ())}"
-        for name, track in tracks.items()
-        if name.startswith("set.")
+    changes = {name.removeprefix("set."): track for name, track in tracks.items() if name.startswith("set.")}
+    # A measured material replaces every parameter, so it goes before the numbers that change it further.
+    names = [f"{name}={_held(track, number)}" for name, track in changes.items() if _is_text(track)]
+    numbers = [
+        f"{name}={','.join(repr(v) for v in _between(track, number) or ())}"
+        for name, track in changes.items()
+        if not _is_text(track)
     ]
     return Shot(
         number,
@@ -104,8 +122,12 @@ def _shot(path: Path, number: int, tracks: dict[str, list[tuple[float, Any]]], d
         rotate[0] if rotate else default.env_rotate,
         _held(tracks.get("camera"), number) or default.camera,
         exposure[0] if exposure else default.exposure,
-        default.settings + tuple(settings),
+        (*default.settings, *names, *numbers),
     )
+
+
+def _is_text(track: list[tuple[float, Any]]) -> bool:
+    return isinstance(track[0][1], str)
 
 
 def _held(track: list[tuple[float, Any]] | None, number: int) -> str | None:

@@ -165,7 +165,8 @@ def test_inputs_are_not_overwritten(here, refused):
         (("--exposure", "inf"), ("--exposure", "finite")),
         (("--camera", "side"), ("--camera side", "main")),
         (("--set", "gold"), ("--set gold", "MATERIAL.PARAMETER=VALUE")),
-        (("--set", "ball=velvet"), ("--set ball=velvet", "measured material")),
+        (("--set", "ball=velvet"), ("--set ball=velvet", "no measured material 'velvet'", "chrome", "PARAMETER=VALUE")),
+        (("--set", "ground=crome"), ("no measured material 'crome'", "Did you mean 'chrome'?")),
         (("--set", "bell.f0=1"), ("no material 'bell'", "Did you mean 'ball'?")),
         (("--set", "ball.color=1,1,1"), ("no parameter 'color'", "diffuse, specular, f0, roughness")),
         (("--set", "ground.f0=1"), ("lambert has no parameter 'f0'",)),
@@ -226,6 +227,8 @@ def test_scenes_without_environment_or_camera(here, refused):
         ("format = 1\nframes = 1\n[[key]]\nframe = 1\ncamera = 'side'\n", "frame 1: --camera side"),
         ("format = 1\nframes = 1\n[[key]]\nframe = 1\nset = {'ball.shine' = 1}\n", "no parameter 'shine'"),
         ("format = 1\nframes = 1\n[[key]]\nframe = 1\nset = {ball.f0 = 1}\n", "key[0].set.ball"),
+        ("format = 1\nframes = 1\n[[key]]\nframe = 1\nset = {ball = 'velvet'}\n", "key[0].set.ball: no measured"),
+        ("format = 1\nframes = 1\n[[key]]\nframe = 1\nset = {'ball.f0' = 'chrome'}\n", "f0: expected one number"),
     ],
 )
 def test_frames(here, refused, text, words):

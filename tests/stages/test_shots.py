@@ -49,6 +49,22 @@ def test_texts_hold_until_the_next(tmp_path):
     assert [s.camera for s in found] == ["a"] * 4
 
 
+def test_measured_materials_hold_and_numbers_go_on_top(tmp_path):
+    # The numbers' key stands first; the material would wipe them out if it came after them.
+    found = shots(
+        tmp_path,
+        "frames = 4\n"
+        "[[key]]\nframe = 1\nset = { 'floor.roughness' = 0.1 }\n"
+        "[[key]]\nframe = 2\nset = { floor = 'Blue Acrylic' }\n"
+        "[[key]]\nframe = 3\nset = { floor = 'chrome', 'floor.roughness' = 0.3 }\n",
+    )
+    roughness = ("0.1", "0.2", "0.3", "0.3")
+    names = ("blue-acrylic", "blue-acrylic", "chrome", "chrome")
+    assert [s.settings for s in found] == [
+        ("gold.f0=0.5", f"floor={name}", f"floor.roughness={m}") for name, m in zip(names, roughness, strict=True)
+    ]
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -67,7 +83,18 @@ def test_texts_hold_until_the_next(tmp_path):
         ("frames = 2\n[[key]]\nframe = 1\nenv_rotate = 'x'", r"key\[0\].env_rotate: expected a finite number"),
         ("frames = 2\n[[key]]\nframe = 1\nrotate = 3", r"key\[0\].rotate: unknown key"),
         ("frames = 2\n[[key]]\nframe = 1\nset = 3", r"key\[0\].set: expected a table"),
-        ("frames = 2\n[[key]]\nframe = 1\nset = { a = 'x' }", r"key\[0\].set.a: expected a finite number"),
+        ("frames = 2\n[[key]]\nframe = 1\nset = { a = 'crome' }", r"key\[0\].set.a: no measured .*'chrome'\?"),
+        ("frames = 2\n[[key]]\nframe = 1\nset = { a = '0.5' }", r"key\[0\].set.a: no measured material '0.5'"),
+        ("frames = 2\n[[key]]\nframe = 1\nset = { a = ['x'] }", r"key\[0\].set.a: expected a finite number"),
+        ("frames = 2\n[[key]]\nframe = 1\nset = { a = true }", r"key\[0\].set.a: expected a finite number"),
+        (
+            "frames = 2\n[[key]]\nframe = 1\nset = { a = 1 }\n[[key]]\nframe = 2\nset = { a = 'chrome' }",
+            r"key\[1\].set.a: expected a number, as in the key before; found 'chrome'",
+        ),
+        (
+            "frames = 2\n[[key]]\nframe = 1\nset = { a = 'chrome' }\n[[key]]\nframe = 2\nset = { a = 1 }",
+            r"key\[1\].set.a: expected a measured material, as in the key before; found 1",
+        ),
         (
             "frames = 2\n[[key]]\nframe = 1\nset = { a = 1 }\n[[key]]\nframe = 2\nset = { a = [1, 2, 3] }",
             r"key\[1\].set.a: expected 1 numbers",
