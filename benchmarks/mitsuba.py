@@ -44,12 +44,13 @@ def our_pictures(store: Path, sky: Path) -> tuple[NDArray[np.float32], float, fl
     normals = primary.face_normals(geometry.positions, geometry.faces)
     tracer = Tracer(geometry.positions, geometry.faces)
     samples = primary.see(tracer, make_film(camera), geometry.face_object, normals)
-    matrix = picture.vertex_matrix(geometry, samples, normals, *lighting.receiver_of_vertex(), width * height)
+    front, back = lighting.receiver_of_vertex()
+    matrix = picture.vertex_matrix(geometry, samples, normals, front, back, lighting.buried(), width * height)
     active = matrix.used(len(lighting))
     environment = read_environment(sky)
 
     def frame(rotate: float) -> NDArray[np.float32]:
-        radiance = lighting.exit_radiance(environment, rotate, materials, None, active)
+        radiance = lighting.exit_radiance(environment, rotate, materials, None, active)[0]
         out: NDArray[np.float32] = picture.assemble(matrix, radiance.diffuse, None, cores())
         return out.reshape(height, width, 3)
 

@@ -85,9 +85,13 @@ def decide(
     positions: NDArray[np.float64],
     faces: NDArray[np.int32],
     both_sides: bool,
+    lobes: bool,
     bounces: int,
 ) -> list[Decision]:
-    """The plan for a static scene: `direct` always, `shadows` unless nothing can block anything, `bounces` with it."""
+    """The plan for a static scene: `direct` always, `shadows` unless nothing can block anything, `bounces` with it.
+
+    both_sides: any object is lit from both; lobes: any material has a specular lobe, or may get one.
+    """
     shadows = _shadows(asked, positions, faces, both_sides)
     plan = [Decision("direct", True, "always"), shadows]
     for name, number in BOUNCES.items():
@@ -97,7 +101,8 @@ def decide(
             plan.append(Decision(name, False, "no light can go from one point of the scene to another"))
         else:
             plan.append(Decision(name, True, f"asked for: {bounces} interreflections"))
-    return plan
+    evidence = "integrated from visibility when a picture is made" if lobes else "no material has a specular lobe"
+    return [*plan, Decision("specular", lobes, evidence)]
 
 
 def _shadows(

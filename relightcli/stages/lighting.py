@@ -128,6 +128,12 @@ class LightingStore:
             )
         return receivers_of_vertices(self.vertex, self.side, len(self.geometry.positions))
 
+    def buried(self) -> NDArray[np.bool_]:
+        """Vertex receivers that nothing can see, (N,)."""
+        found: Any = self.store.read("receivers/buried")
+        buried: NDArray[np.bool_] = found
+        return buried
+
     def blocks(self) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
         """Visibility bits in ranges of receivers: all at once if they are in memory, else chunk by chunk."""
         if self._bits is not None:

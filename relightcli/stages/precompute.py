@@ -87,7 +87,7 @@ def precompute(config: Config) -> dict[str, Any]:
     check_receivers(config.receivers, scene, geometry, both)
     if bounces:
         _check_bounces(config)
-    plan = effects.decide(asked, geometry.positions, geometry.faces, bool(both.any()), bounces)
+    plan = effects.decide(asked, geometry.positions, geometry.faces, bool(both.any()), _lobes(scene), bounces)
     simulated = [d.effect for d in plan if d.simulate]
     shadows = "shadows" in simulated
     bounce_cells = config.bounce_resolution if "one-bounce" in simulated else 0
@@ -217,6 +217,11 @@ def _both_sides(scene: Scene, geometry: Geometry) -> NDArray[np.bool_]:
     translucent = np.array([materials[m].model == "translucent" for m in geometry.material], bool)
     both: NDArray[np.bool_] = geometry.two_sided | translucent
     return both
+
+
+def _lobes(scene: Scene) -> bool:
+    """Whether any material has a specular lobe, or may be given one when a picture is made."""
+    return any(m.model not in ("lambert", "translucent") or m.adjustable for m in scene.materials.values())
 
 
 def _summary(config: Config, started: float, resumed: bool, geometry: Geometry) -> dict[str, Any]:

@@ -132,8 +132,7 @@ class Session:
         base = primary.TEXTURE_GRID if geometry.textures else primary.BASE_GRID
         samples = primary.see(self._tracer, film, geometry.face_object, normals, base)
         front, back = lighting.receiver_of_vertex()
-        buried: Any = lighting.store.read("receivers/buried")
-        matrix = picture.vertex_matrix(geometry, samples, normals, front, back, buried, width * height)
+        matrix = picture.vertex_matrix(geometry, samples, normals, front, back, lighting.buried(), width * height)
         towards = _towards(film.eye, lighting.position)
         return _View(camera, matrix, samples.coverage, matrix.used(len(lighting)), towards)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from relightcli.errors import InputError
-from relightcli.plan.effects import AVAILABLE, blocks_nothing, decide, need_static, parse_effects
+from relightcli.plan.effects import AVAILABLE, blocks_nothing, bounces_asked, decide, need_static, parse_effects
 from tests.core.transport.scenes import sphere_grid
 
 BALL, BALL_FACES = (x[0].astype(x[1]) for x in zip(sphere_grid(12, 24), (np.float64, np.int32), strict=True))
@@ -24,7 +24,9 @@ def test_names():
     [
         ("caustics", "expected auto, all or names out of direct, .*; found 'caustics'"),
         ("", "found ''"),
-        ("direct,one-bounce", "'one-bounce' is not simulated by this version"),
+        ("direct,fields", "'fields' is not simulated by this version"),
+        ("direct,one-bounce", "'one-bounce' needs 'shadows'"),
+        ("direct,shadows,two-bounce", "'two-bounce' needs 'one-bounce'"),
         ("shadows", "'direct' must be among them"),
     ],
 )
@@ -73,10 +75,56 @@ def test_nothing_to_test():
     assert blocks_nothing(SQUARE, np.zeros((1, 3), np.int32)) is None
 
 
-def shadows(asked, both=False, positions=BALL, faces=BALL_FACES):
-    plan = {d.effect: d for d in decide(asked, positions, faces, both)}
+def plan_of(asked, both=False, positions=BALL, faces=BALL_FACES, lobes=False, bounces=0):
+    plan = {d.effect: d for d in decide(asked, positions, faces, both, lobes, bounces)}
     assert plan["direct"].simulate
-    return plan["shadows"]
+    return plan
+
+
+def shadows(*args, **kwargs):
+    return plan_of(*args, **kwargs)["shadows"]
+
+
+def test_bounces_are_simulated_when_asked_for_and_possible():
+    bowl = BALL_FACES[:, ::-1]
+    names = ("one-bounce", "two-bounce")
+    for bounces, expected in ((0, [False, False]), (1, [True, False]), (2, [True, True]), (9, [True, True])):
+        plan = plan_of(None, faces=bowl, bounces=bounces)
+        assert [plan[name].simulate for name in names] == expected
+    convex = plan_of(None, bounces=2)
+    assert not any(convex[name].simulate for name in names)
+    assert "no light can go" in convex["one-bounce"].evidence
+
+
+def test_lobes_are_told():
+    assert plan_of(None, lobes=True)["specular"].simulate
+    assert "no material" in plan_of(None)["specular"].evidence
+
+
+@pytest.mark.parametrize(
+    ("effects", "bounces", "expected"),
+    [
+        ("auto", None, 0),
+        ("auto", 3, 3),
+        ("all", None, 2),
+        ("all", 5, 5),
+        ("direct,shadows", None, 0),
+        ("direct,shadows", 0, 0),
+        ("direct,shadows,one-bounce", None, 1),
+        ("direct,shadows,one-bounce", 1, 1),
+        ("direct,shadows,one-bounce,two-bounce", 4, 4),
+    ],
+)
+def test_number_of_bounces(effects, bounces, expected):
+    assert bounces_asked(parse_effects(effects), bounces) == expected
+
+
+@pytest.mark.parametrize(
+    ("effects", "bounces"), [("direct,shadows", 1), ("direct,shadows,one-bounce", 2), ("all", 0), ("all", 1)]
+)
+def test_names_and_number_must_agree(effects, bounces):
+    with pytest.raises(InputError, match=f"--bounces {bounces}: --effects names"):
+        bounces_asked(parse_effects(effects), bounces)
 
 
 def test_decisions_come_with_their_evidence():

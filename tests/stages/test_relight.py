@@ -220,7 +220,7 @@ def test_frame_numbers(pattern, name):
         ("a.exr", {"env": "dawn"}, InputError, "--env dawn: no such file.*smooth, patchy"),
         ("a.exr", {"camera": "top"}, InputError, "--camera top: not in the scene; it has main, side"),
         ("a.exr", {"env_rotate": float("nan")}, InputError, "finite"),
-        ("a.exr", {"bounces": 2}, InputError, "--bounces 2: the store holds direct light"),
+        ("a.exr", {"bounces": 2}, StoreError, "holds direct light only; precompute with --bounces"),
         ("a.exr", {"basis": "haar"}, StoreError, "precompute it with --basis haar"),
         ("a.exr", {"settings": ("silver.f0=1",)}, InputError, "no material 'silver'"),
         ("a.exr", {"settings": ("gold.f0=2",)}, InputError, "f0"),

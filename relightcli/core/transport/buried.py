@@ -1,4 +1,7 @@
-"""Receivers that no camera can see, under a thing that stands on them or inside it, and where they go.
+"""Receivers that cannot stand on their vertex: where surfaces meet, under things and inside them.
+
+Where a wall stands on a floor, the vertices along the line lie in the planes of both, and rays from there are blocked
+at once. A receiver whose rays end in next to nothing steps aside, onto one of its vertex's faces.
 
 A floor's vertex below a table's foot gets no light; interpolated, it would darken the floor around the foot. Such a
 receiver is found by a few rays: it is buried if none of them leaves the scene, and either each ends closer than the
@@ -20,6 +23,8 @@ from relightcli.core.transport.receivers import Receivers
 
 FIRST, ALL = 8, 56  # rays of every receiver, and of those whose first ones all end on something
 INSIDE = 0.5  # share of rays that end on backs, from which a point counts as inside
+TOUCHING = 1 / 256  # of the distance to the neighbours: rays that end closer have hardly begun
+ASIDE = 1 / 64  # of the way to a face's opposite edge
 STEPS = (1 / 16, 2 / 16, 3 / 16, 4 / 16, 6 / 16, 8 / 16, 12 / 16, 15 / 16)  # of the way to a face's opposite edge
 BATCH = 1 << 16
 
@@ -55,10 +60,20 @@ def unbury(
     """
     reach = _edge_lengths(positions, faces)[receivers.vertex]
     place = receivers.position.copy()
-    buried = find_buried(tracer, place, receivers.normal, reach, face_normals, two_sided)
-    # Pairs of a buried receiver and one of its faces, by receiver.
+    touching = _touching(tracer, place, receivers.normal, reach)
+    # Corners of faces by vertex: vertex v's are corner[first[v]] to corner[first[v + 1]].
     corner = np.argsort(faces.reshape(-1), kind="stable")
     first = np.searchsorted(faces.reshape(-1)[corner], np.arange(len(positions) + 1))
+
+    def along(at: NDArray[np.intp], step: float) -> NDArray[np.float64]:
+        face, k = at // 3, at % 3
+        here = positions[faces[face, k]]
+        across = 0.5 * (positions[faces[face, (k + 1) % 3]] + positions[faces[face, (k + 2) % 3]])
+        moved: NDArray[np.float64] = here + step * (across - here)
+        return moved
+
+    place[touching] = along(corner[first[receivers.vertex[touching]]], ASIDE)
+    buried = find_buried(tracer, place, receivers.normal, reach, face_normals, two_sided)
     for step in STEPS:
         left = np.flatnonzero(buried)
         vertex = receivers.vertex[left]
@@ -67,16 +82,26 @@ def unbury(
         if len(who) == 0:
             break
         within = np.arange(len(who)) - np.repeat(np.cumsum(count) - count, count)
-        at = corner[np.repeat(first[vertex], count) + within]
-        face, k = at // 3, at % 3
-        here = positions[faces[face, k]]
-        across = 0.5 * (positions[faces[face, (k + 1) % 3]] + positions[faces[face, (k + 2) % 3]])
-        there = here + step * (across - here)
+        there = along(corner[np.repeat(first[vertex], count) + within], step)
         free = ~find_buried(tracer, there, receivers.normal[who], reach[who], face_normals, two_sided)
         moved, chosen = np.unique(who[free], return_index=True)
         place[moved] = there[free][chosen]
         buried[moved] = False
     return replace(receivers, position=place), buried
+
+
+def _touching(
+    tracer: NearestTracer, positions: NDArray[np.float64], normals: NDArray[np.float32], reach: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Points (N,) from which a ray ends at once."""
+    out = np.zeros(len(positions), bool)
+    for start in range(0, len(positions), BATCH // FIRST):
+        rows = slice(start, start + BATCH // FIRST)
+        origins = np.repeat(tracer.offset(positions[rows], normals[rows]), FIRST, axis=0)
+        hits = tracer.intersect(origins, _directions(normals[rows], 0, FIRST))
+        near = hits.distance < np.repeat(reach[rows] * (TOUCHING * tracer.scale), FIRST)
+        out[rows] = ((hits.face >= 0) & near).reshape(-1, FIRST).any(axis=1)
+    return out
 
 
 def find_buried(

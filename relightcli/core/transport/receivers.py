@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-BESIDE = 1.0 / 64.0  # of the way from a vertex to the centre of its face
-
 
 @dataclass(frozen=True)
 class Receivers:
@@ -35,11 +33,7 @@ def vertex_receivers(
     vertex_object: NDArray[np.int32],
     both_sides: NDArray[np.bool_],
 ) -> Receivers:
-    """One receiver per vertex that a face uses, two where its object is lit from `both_sides` (bool per object).
-
-    It stands on one of the vertex's faces, just beside the vertex: where surfaces meet, the vertex itself lies in the
-    planes of both, and rays from there would all be blocked at once.
-    """
+    """One receiver per vertex that a face uses, two where its object is lit from `both_sides` (bool per object)."""
     used = np.zeros(len(positions), bool)
     used[faces.reshape(-1)] = True
     front = np.flatnonzero(used)
@@ -49,25 +43,12 @@ def vertex_receivers(
     order = spatial_order(positions[vertex], side)
     vertex, side = vertex[order], side[order]
     return Receivers(
-        _beside(positions, faces)[vertex],
+        positions[vertex],
         (normals[vertex] * side[:, None]).astype(np.float32),
         vertex_object[vertex].astype(np.int32),
         vertex,
         side,
     )
-
-
-def _beside(positions: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Every vertex moved a little towards the centre of the first of its faces that has an area; same shape."""
-    corner = positions[faces]
-    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
-    solid = np.flatnonzero(area > 0)[::-1]
-    of_vertex = np.full(len(positions), -1)
-    of_vertex[faces[solid].reshape(-1)] = np.repeat(solid, 3)  # the last one written, that is the first face, stays
-    has = of_vertex >= 0
-    out = positions.copy()
-    out[has] += BESIDE * (corner[of_vertex[has]].mean(axis=1) - positions[has])
-    return out
 
 
 def receivers_of_vertices(

@@ -26,7 +26,7 @@ def plate(two_sided=False, facing_down=True, normal=None, height=1.0, half=0.5):
     normals = np.tile(np.array(normal, np.float32), (4, 1))
     front = np.arange(4, dtype=np.int32)
     back = np.arange(4, 8, dtype=np.int32) if two_sided else np.full(4, -1, np.int32)
-    return Surfaces(positions, normals, faces, np.full(2, two_sided), front, back)
+    return Surfaces(positions, normals, faces, np.full(2, two_sided), front, back, np.zeros(8, bool))
 
 
 def seen(surfaces, positions=ORIGIN, normals=UP, first=0, seed=0, cells=C):
