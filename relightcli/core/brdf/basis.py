@@ -24,8 +24,8 @@ SPECULAR_FUNCTIONS = 4
 
 @dataclass(frozen=True, eq=False)
 class BrdfBasis:
-    """functions (P, n, n) float64 sr^-1, [p, view cell, light cell], the last one 1/pi; coefficients (H, P-1) float64 of
-    the set's entries; norm2 and error2: sum of f^2 dA^2 over the set, and of the squared difference."""
+    """functions (P, n, n) float64 sr^-1, [p, view cell, light cell], the last one 1/pi; coefficients (H, P-1) float64
+    of the set's entries; norm2 and error2: sum of f^2 dA^2 over the set, and of the squared difference."""
 
     grid: DiscGrid
     functions: NDArray[np.float64]

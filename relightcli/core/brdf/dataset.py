@@ -99,8 +99,8 @@ def table_set(values: NDArray[np.floating[Any]], resolution: int = RESOLUTION) -
     table = np.asarray(values, np.float64)
     if table.ndim != 3 or len(table) == 0 or table.shape[1:] != (len(grid), len(grid)):
         raise InputError(
-            f"BRDF table has shape {table.shape}; expected (entries, {len(grid)}, {len(grid)}) for a disc resolution of "
-            f"{resolution}."
+            f"BRDF table has shape {table.shape}; expected (entries, {len(grid)}, {len(grid)}) for a disc resolution "
+            f"of {resolution}."
         )
     if not (np.isfinite(table).all() and table.min() >= 0.0):
         raise InputError("BRDF table has values that are negative or not finite; expected reflectances in 1/sr.")

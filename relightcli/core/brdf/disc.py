@@ -32,8 +32,9 @@ class DiscGrid:
     """n cells of an N x N grid.
 
     position (n, 2) float64, centres p; direction (n, 3) float64 unit; lookup (N, N) int64, [column of x, row of y] to
-    the cell, or to the nearest one where the centre is outside the disc; images (8, n) int64, cell to cell under the turns
-    by 0, 90, 180 and 270 degrees and under each of them followed by a reflection; octant (m,) int64, the cells with x >= y > 0, one for each orbit of the symmetries.
+    the cell, or to the nearest one where the centre is outside the disc; images (8, n) int64, cell to cell under the
+    turns by 0, 90, 180 and 270 degrees and under each of them followed by a reflection; octant (m,) int64, the cells
+    with x >= y > 0, one for each orbit of the symmetries.
     """
 
     resolution: int

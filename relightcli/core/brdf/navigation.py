@@ -42,9 +42,9 @@ def exponent_mix(exponents: NDArray[np.float64], exponent: float) -> Mix:
 def fresnel_roughness_mix(points: NDArray[np.float64], f0: float, roughness: float) -> Mix:
     """Barycentric in the Delaunay triangulation of `points` (H, 2) of f0 and roughness (above 0), not empty.
 
-    Triangulated and interpolated over (f0, log roughness), each scaled to the points' extent: lobes resemble each other
-    by the ratio of their widths, and roughnesses of real materials run over two decades. Outside of the hull the nearest
-    point of it is taken, in that scale; a set on one line is interpolated along the line.
+    Triangulated and interpolated over (f0, log roughness), each scaled to the points' extent: lobes resemble each
+    other by the ratio of their widths, and roughnesses of real materials run over two decades. Outside of the hull the
+    nearest point of it is taken, in that scale; a set on one line is interpolated along the line.
     """
     found = np.asarray(points, np.float64)
     same = np.flatnonzero((found[:, 0] == f0) & (found[:, 1] == roughness))

@@ -69,7 +69,7 @@ def normaliser(degrees: float) -> float:
 
 
 def lobe_columns(grid: DiscGrid, degrees: Sequence[float]) -> NDArray[np.float64]:
-    """Integral of each G_k over every light cell, mean over the view cell: (m, K, n) float64 for the octant's view cells.
+    """Integral of each G_k over every light cell, mean over the view cell: (m, K, n) float64 for the octant.
 
     A row sums to the part of the lobe that is above the horizon.
     """

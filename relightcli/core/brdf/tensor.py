@@ -3,8 +3,9 @@
     f(w, w_o, w_i) ~ f_s + sum over i, j, k of D(i, j, k) (w'U_h)(i) U_o(w_o, j) U_i(w_i, k)       [Sun 2007, Eq. 2]
 
 for a mix w of the set's entries (`relightcli.core.brdf.navigation`). f_s are the lobes of
-`relightcli.core.brdf.specular_lobes`, the tensor approximates f_r = f - f_s. Pairs of view and of light factors are kept
-whole, so an isotropic set stays isotropic: a rank that would cut one is moved up by one, and `closed` says so.
+`relightcli.core.brdf.specular_lobes`, the tensor approximates f_r = f - f_s, both as means over cells. Pairs of view
+and of light factors are kept whole, so an isotropic set stays isotropic: a rank that would cut one is moved up by one,
+and `closed` says so.
 """
 
 from __future__ import annotations

@@ -127,7 +127,7 @@ def mode_product(x: NDArray[np.floating[Any]], matrix: NDArray[np.float64], mode
 
 def mode_gram(x: NDArray[np.floating[Any]], mode: int) -> NDArray[np.float64]:
     """Gram matrix (size, size) float64 of the unfolding of x along `mode`, without a copy of x."""
-    n0, n1, n2 = x.shape
+    n0, n1, _ = x.shape
     gram = np.zeros((x.shape[mode], x.shape[mode]))
     if mode == 0:
         for k in range(n1):
