@@ -32,6 +32,8 @@ _CONVERGED = 1e-6
 _ROUND_OFF = 1e-12
 # Neighbouring eigenvalues closer than this, relative, belong to one pair (cos m phi, sin m phi).
 _PAIR = 0.02
+# Columns of an unfolding that are turned into float64 at a time.
+_BLOCK = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,15 +129,16 @@ def mode_product(x: NDArray[np.floating[Any]], matrix: NDArray[np.float64], mode
 
 def mode_gram(x: NDArray[np.floating[Any]], mode: int) -> NDArray[np.float64]:
     """Gram matrix (size, size) float64 of the unfolding of x along `mode`, without a copy of x."""
-    n0, n1, _ = x.shape
+    n0, n1, n2 = x.shape
     gram = np.zeros((x.shape[mode], x.shape[mode]))
-    if mode == 0:
-        for k in range(n1):
-            part = x[:, k, :].astype(np.float64)
+    if mode == 1:
+        for slab in x:
+            part = slab.astype(np.float64, copy=False)
             gram += part @ part.T
         return gram
-    for k in range(n0):
-        part = x[k].astype(np.float64) if mode == 1 else x[k].T.astype(np.float64)
+    flat = x.reshape(n0, n1 * n2) if mode == 0 else x.reshape(n0 * n1, n2).T
+    for start in range(0, flat.shape[1], _BLOCK):
+        part = flat[:, start : start + _BLOCK].astype(np.float64, copy=False)
         gram += part @ part.T
     return gram
 
