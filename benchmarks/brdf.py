@@ -25,6 +25,7 @@ from benchmarks.scenes import Setting, shared_data
 
 N_H = (1, 2, 3, 4, 5, 6)
 N_I = (4, 8, 12, 16, 20, 24, 28, 32)
+QUICK_N_H, QUICK_N_I = (1, 4, 6), (4, 8, 32)
 DEFAULT = (4, 8)
 COARSEST, FINEST = (1, 4), (6, 32)
 CORE = (16, 64, 64)
@@ -62,25 +63,24 @@ def _measured_points() -> tuple[list[tuple[float, float]], str]:
     return grid, "a grid of f0 and roughness"
 
 
-def curves(values: NDArray[np.float64], remainder: NDArray[np.float64], entries: Sequence[tuple[int, int]]) -> Curves:
-    """Errors over the grid of ranks; remainder: values without lobes."""
+def curves(values: NDArray[np.float64], remainder: NDArray[np.float64], ranks: Sequence[tuple[int, int]]) -> Curves:
+    """Errors at `ranks` (n_h, n_i), by entry at DEFAULT and FINEST; remainder: values without lobes."""
     from relightcli.core.compress.tucker import hooi, hosvd, mode_product
 
     norm2 = float((values**2).sum())
     coarse = hosvd(remainder, CORE, paired=(1, 2))
     factors: list[Any] = list(coarse.factors)
     out = Curves()
-    for n_i in N_I:
-        for n_h in N_H:
-            found = hooi(coarse.core, (n_h, n_i, n_i), paired=(1, 2))
-            out.error[n_h, n_i] = (coarse.error2 + found.error2) / norm2
-            out.used[n_h, n_i] = found.core.shape[2]
-            if (n_h, n_i) in entries:
-                u_h, u_o, u_i = (big @ small for big, small in zip(factors, found.factors, strict=True))
-                projected = mode_product(mode_product(remainder, u_i.T, 2), u_o.T, 1)
-                near = mode_product(found.core, u_h, 0)
-                left = (remainder**2).sum((1, 2)) - (projected**2).sum((1, 2)) + ((projected - near) ** 2).sum((1, 2))
-                out.by_entry[n_h, n_i] = left / (values**2).sum((1, 2))
+    for n_h, n_i in ranks:
+        found = hooi(coarse.core, (n_h, n_i, n_i), paired=(1, 2))
+        out.error[n_h, n_i] = (coarse.error2 + found.error2) / norm2
+        out.used[n_h, n_i] = found.core.shape[2]
+        if (n_h, n_i) in (DEFAULT, FINEST):
+            u_h, u_o, u_i = (big @ small for big, small in zip(factors, found.factors, strict=True))
+            projected = mode_product(mode_product(remainder, u_i.T, 2), u_o.T, 1)
+            near = mode_product(found.core, u_h, 0)
+            left = (remainder**2).sum((1, 2)) - (projected**2).sum((1, 2)) + ((projected - near) ** 2).sum((1, 2))
+            out.by_entry[n_h, n_i] = left / (values**2).sum((1, 2))
     return out
 
 
@@ -95,7 +95,7 @@ def rows_of(name: str, bare: Curves, lobed: Curves, mirror: Curves) -> list[Row]
     rows.append(Row(f"{default}, with lobes", lobed.error[DEFAULT], UNIT, against, ratio, "below it", ratio > 1))
     rows.append(Row(f"{default}, with the mirror alone", mirror.error[DEFAULT], UNIT))
     rows.append(Row(f"{default}, without", bare.error[DEFAULT], UNIT))
-    for n in (8, 32):
+    for n in (DEFAULT[1], FINEST[1]):
         ratio = lobed.error[4, n] / lobed.error[6, n]
         target = f"<= {CONVERGED:g}"
         work = f"{name}: n_h = 4 over n_h = 6, n = {n}, with lobes"
@@ -125,7 +125,7 @@ def bands(parameters: NDArray[np.float64], bare: Curves, lobed: Curves) -> Table
     return Table(title, columns, tuple(rows))
 
 
-def plot(path: Path, found: dict[str, dict[str, Curves]]) -> None:
+def plot(path: Path, found: dict[str, dict[str, Curves]], views: Sequence[int], entries: Sequence[int]) -> None:
     """Error over n, a line for every n_h: solid with lobes, dashed without."""
     import matplotlib
 
@@ -135,10 +135,10 @@ def plot(path: Path, found: dict[str, dict[str, Curves]]) -> None:
     figure, axes = pyplot.subplots(1, len(found), figsize=(5.5 * len(found), 4.5), sharey=True, layout="constrained")
     for axis, (name, by_lobes) in zip(axes, found.items(), strict=True):
         for lobes, style in (("with lobes", "-"), ("without", "--")):
-            for k, n_h in enumerate(N_H):
-                line = [by_lobes[lobes].error[n_h, n] for n in N_I]
-                axis.semilogy(N_I, line, style, color=f"C{k}", marker=".", label=f"n_h = {n_h}, {lobes}")
-        axis.set(title=name, xlabel="n of views and of lights", xticks=N_I)
+            for k, n_h in enumerate(entries):
+                line = [by_lobes[lobes].error[n_h, n] for n in views]
+                axis.semilogy(views, line, style, color=f"C{k}", marker=".", label=f"n_h = {n_h}, {lobes}")
+        axis.set(title=name, xlabel="n of views and of lights", xticks=views)
     axes[0].set_ylabel("relative squared error, measure cos cos dw dw")
     axes[-1].legend(ncols=2, fontsize="x-small")
     figure.savefig(path, dpi=150)
@@ -151,7 +151,9 @@ def measure(setting: Setting) -> Report:
     from relightcli.core.brdf.specular_lobes import LOBES, MIRROR, fit_lobes, lobes_on_grid
     from relightcli.core.compress.tucker import hooi
 
-    resolution = 16 if setting.quick else 32
+    resolution = 12 if setting.quick else 32
+    entries, views = (QUICK_N_H, QUICK_N_I) if setting.quick else (N_H, N_I)
+    ranks = [(n_h, n) for n in views for n_h in entries]
     points, origin = _measured_points()
     exponents = BLINN_PHONG_EXPONENTS[::20] if setting.quick else BLINN_PHONG_EXPONENTS
     points = points[::5] if setting.quick else points
@@ -179,7 +181,7 @@ def measure(setting: Setting) -> Report:
                 whole = hooi(remainder, (DEFAULT[0], DEFAULT[1], DEFAULT[1]), paired=(1, 2))
                 times.append(time.perf_counter() - clock)
                 direct = whole.error2 / float((brdfs.values**2).sum())
-            found[name][lobes] = curves(brdfs.values, remainder, (DEFAULT, FINEST))
+            found[name][lobes] = curves(brdfs.values, remainder, ranks)
         del remainder
         of = found[name]
         report.rows += rows_of(name, of["without"], of["with lobes"], of["mirror"])
@@ -195,18 +197,18 @@ def measure(setting: Setting) -> Report:
             report.rows.append(Row(f"{name}: n_h = 6, n = 32, without lobes", of["without"].error[FINEST], UNIT, paper))
             report.tables.append(bands(brdfs.parameters, of["without"], of["with lobes"]))
         for lobes in ("with lobes", "without"):
-            for n in N_I:
-                used = max(of[lobes].used[n_h, n] for n_h in N_H)
+            for n in views:
+                used = max(of[lobes].used[n_h, n] for n_h in entries)
                 label = f"{n} ({used} with the pair closed)" if used > n else str(n)
-                grid.append((name, lobes, label, *(of[lobes].error[n_h, n] for n_h in N_H)))
+                grid.append((name, lobes, label, *(of[lobes].error[n_h, n] for n_h in entries)))
         seconds.append((name, *times))
     report.tables.append(
-        Table("relative squared error", ("set", "lobes", "n", *(f"n_h = {n}" for n in N_H)), tuple(grid))
+        Table("relative squared error", ("set", "lobes", "n", *(f"n_h = {n}" for n in entries)), tuple(grid))
     )
     columns = ("set", "sampling the set", "fitting 4 lobes", "HOOI, n_h = 4, n = 8")
     report.tables.append(Table("seconds", columns, tuple(seconds)))
     try:
-        plot(setting.work.parent / "brdf.png", found)
+        plot(setting.work.parent / "brdf.png", found, views, entries)
     except ImportError:
         report.skipped.append("the plot: matplotlib is not installed")
     return report
