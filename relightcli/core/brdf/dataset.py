@@ -7,9 +7,10 @@ sums over o and i with the weight dA^2 are the integrals of f ... cos cos dw dw 
 
 Where a lobe is wide, F is f at the cells' centres. Where it is narrower than the cells, F is the mean of f over both
 cells in the measure dA dA, by 16 view directions times 512 of the lobe's own importance samples: so a lobe keeps its
-energy however narrow it is (roughness 0.005 is 1/12 of a cell at normal incidence, and ever less towards grazing). The
-same mean tames 1/(cos cos) at grazing angles: dA cancels one of the cosines, the lobe's own width the other, and the
-mean is finite where values are not. A lobe counts as narrow at w_o when its standard deviation on the disc,
+energy however narrow it is (at N = 32 roughness 0.005 has a standard deviation of 1/9 of a cell at normal incidence,
+and ever less towards grazing). The same mean tames 1/(cos cos) at grazing angles: dA cancels one of the cosines, the
+lobe's own width the other, and the mean is finite where values are not; no centre is closer to the horizon than
+cos = 0.077 (N = 32). A lobe counts as narrow at w_o when its standard deviation on the disc,
 
     2 cos(theta_o) sigma_h,   sigma_h = m / sqrt(2) (Beckmann), 1 / sqrt(s) (Blinn-Phong),
 

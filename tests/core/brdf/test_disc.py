@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from relightcli.core.brdf.disc import bilinear, cell_of, disc_grid, fold, spread, sub_directions
@@ -80,6 +80,7 @@ def test_interpolation_at_centres_returns_them(n):
 
 
 @pytest.mark.parametrize("n", SIZES)
+@settings(max_examples=60, deadline=None, derandomize=True)
 @given(u=st.floats(0, 1), phi=st.floats(0, 2 * np.pi))
 def test_interpolation_weights_everywhere(n, u, phi):
     grid = disc_grid(n)
