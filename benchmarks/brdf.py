@@ -47,22 +47,6 @@ class Curves:
     by_entry: dict[tuple[int, int], NDArray[np.float64]] = field(default_factory=dict)
 
 
-def _measured_points() -> tuple[list[tuple[float, float]], str]:
-    """(f0, roughness) of measured materials, and what they are; a grid where there are none."""
-    try:
-        from relightcli.core.brdf.measured import fits
-
-        return [(fit.f0, fit.roughness) for fit in fits()], "fits to measured materials [Ngan 2005]"
-    except ImportError:
-        data = shared_data()
-        path = data / "brdf" / "ngan2005_cook_torrance.json" if data else Path()
-        if path.is_file():
-            found = json.loads(path.read_text()).values()
-            return [(fit["F0"], fit["m"]) for fit in found], "fits to measured materials [Ngan 2005]"
-    grid = [(float(f0), float(m)) for f0 in np.linspace(0, 1, 8) for m in np.geomspace(0.005, 1, 12)]
-    return grid, "a grid of f0 and roughness"
-
-
 def curves(values: NDArray[np.float64], remainder: NDArray[np.float64], ranks: Sequence[tuple[int, int]]) -> Curves:
     """Errors at `ranks` (n_h, n_i), by entry at DEFAULT and FINEST; remainder: values without lobes."""
     from relightcli.core.compress.tucker import hooi, hosvd, mode_product

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 import relight_formats as formats
 from relightcli.core.brdf.models import SPECULAR, MaterialTable, pack_materials, widen
-from relightcli.core.brdf.separable import MOST_TERMS
+from relightcli.core.brdf.separable import TERMS
 from relightcli.core.lights.environment import SkyCube, latlong_to_cube, splat
 from relightcli.core.shade.bounces import Exit, bounce
 from relightcli.core.shade.gather import Gather, build_gather, join
@@ -252,7 +252,7 @@ class LightingStore:
         table = widen(coats.table, 0.5 * np.pi / gather.cells)
         factors = lobe_factors(table)
         row = lobe_rows(coats.material, factors)
-        lobe = np.zeros((int(row.max()) + 1, 6, MOST_TERMS), np.float32)
+        lobe = np.zeros((int(row.max()) + 1, 6, TERMS), np.float32)
         if len(lobe):
             sky = splat(latlong_to_cube(environment, gather.cells, rotate))
             for block, bits in self.blocks():

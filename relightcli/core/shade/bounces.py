@@ -21,7 +21,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.brdf.models import MaterialTable, dot, lobes_and_density
-from relightcli.core.brdf.separable import MOST_ORDERS, MOST_TERMS
+from relightcli.core.brdf.separable import TERMS
 from relightcli.core.shade.gather import Gather, in_parts
 from relightcli.core.shade.lobe_factors import LobeFactors, axes_of, gather_lobe, send_lobe, waves
 from relightcli.core.sphere import cube
@@ -95,7 +95,7 @@ def _bounce(  # type: ignore[no-untyped-def]
     go_on, irradiance, specular, lobe_out,
 ):  # fmt: skip
     row = light.row
-    wave, circle = np.empty((2, MOST_TERMS), np.float32), np.empty((2, MOST_ORDERS), np.float32)
+    wave = np.empty((2, TERMS), np.float32)
     for i in range(first, last):
         if not (active[i] or go_on):
             continue
@@ -115,7 +115,7 @@ def _bounce(  # type: ignore[no-untyped-def]
                 p = material[y]
                 other = axes_of((np.float64(normals[y, 0]), np.float64(normals[y, 1]), np.float64(normals[y, 2])))
                 back = (-d[0], -d[1], -d[2])
-                if waves(factors.view_factor[p], factors.order[p], factors.highest[p], other, back, circle, wave):
+                if waves(factors.view_factor[p], other, back, wave):
                     lr, lg, lb = send_lobe(wave, light.lobe[row[y]])
                     r += lr * factors.colour[p, 0]
                     g += lg * factors.colour[p, 1]
@@ -133,7 +133,7 @@ def _bounce(  # type: ignore[no-untyped-def]
                 sr += s * r
                 sg += s * g
                 sb += s * b
-            if go_on and waves(factors.light_factor[m], factors.order[m], factors.highest[m], axes, d, circle, wave):
+            if go_on and waves(factors.light_factor[m], axes, d, wave):
                 gather_lobe(wave, w * r, w * g, w * b, lobe_out[row[i]])
         irradiance[i, 0], irradiance[i, 1], irradiance[i, 2] = er, eg, eb
         specular[i, 0] = sr * factors.colour[m, 0]

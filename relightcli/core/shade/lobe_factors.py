@@ -22,24 +22,17 @@ from relightcli.core.brdf.models import (
     dot,
 )
 from relightcli.core.brdf.sampling import orthonormal_frame
-from relightcli.core.brdf.separable import MOST_ORDERS, MOST_TERMS, POLAR, separate
+from relightcli.core.brdf.separable import POLAR, ROWS, TERMS, separate
 from relightcli.core.lights.environment import SkyCube
 from relightcli.core.shade.gather import in_parts
 from relightcli.core.sphere import cube
 
-FACTOR_TOLERANCE = 0.1  # relative norm of a lobe that its factors may leave out
-
 
 class LobeFactors(NamedTuple):
-    """Separated lobes of M materials, K = MOST_TERMS terms each, the last ones 0.
-
-    shiny (M,) bool, whether the material has a lobe; highest (M,) int64, its highest order; order (M, K) int64;
-    view_factor, light_factor (M, POLAR, K) float32; colour (M, 3) float32, the specular colour.
-    """
+    """Separated lobes of M materials: shiny (M,) bool, whether there is one; view_factor, light_factor (M, POLAR, K)
+    float32; colour (M, 3) float32, the specular colour. K = TERMS."""
 
     shiny: NDArray[np.bool_]
-    highest: NDArray[np.int64]
-    order: NDArray[np.int64]
     view_factor: NDArray[np.float32]
     light_factor: NDArray[np.float32]
     colour: NDArray[np.float32]
@@ -50,21 +43,15 @@ def lobe_factors(table: MaterialTable) -> LobeFactors:
     m = len(table.model)
     out = LobeFactors(
         np.zeros(m, bool),
-        np.zeros(m, np.int64),
-        np.zeros((m, MOST_TERMS), np.int64),
-        np.zeros((m, POLAR, MOST_TERMS), np.float32),
-        np.zeros((m, POLAR, MOST_TERMS), np.float32),
+        np.zeros((m, POLAR, TERMS), np.float32),
+        np.zeros((m, POLAR, TERMS), np.float32),
         table.parameters[:, SPECULAR : SPECULAR + 3].astype(np.float32),
     )
     for index, model in enumerate(table.model):
-        if model not in (BLINN_PHONG, COOK_TORRANCE, PHONG) or not out.colour[index].any():
-            continue
-        factors = separate(int(model), table.parameters[index], FACTOR_TOLERANCE)
-        k = len(factors.order)
-        out.shiny[index], out.highest[index] = True, factors.order[-1]
-        out.order[index, :k] = factors.order
-        out.view_factor[index, :, :k] = factors.view_factor
-        out.light_factor[index, :, :k] = factors.light_factor
+        if model in (BLINN_PHONG, COOK_TORRANCE, PHONG) and out.colour[index].any():
+            factors = separate(int(model), table.parameters[index])
+            out.shiny[index] = True
+            out.view_factor[index], out.light_factor[index] = factors.view_factor, factors.light_factor
     return out
 
 
@@ -113,36 +100,43 @@ def sky_lobes(
 
 # Order of sums is free, so that loops over the terms become vector instructions.
 FAST = {"reassoc", "contract", "nsz"}
+_ROW_0, _ROW_1, _ROW_2 = ROWS
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
-def waves(factor, order, highest, axes, d, circle, out):  # type: ignore[no-untyped-def]
+def waves(factor, axes, d, out):  # type: ignore[no-untyped-def]
     """Fills out (2, K): every term's factor at the direction d, times cosine and sine of its order's azimuth.
 
-    factor (POLAR, K), order (K,) of one material; axes: two tangents and the normal, unit; circle (2, MOST_ORDERS) is
-    scratch. False below the horizon.
+    factor (POLAR, K) of one material; axes: two tangents and the normal, unit. False below the horizon.
     """
     z = dot(axes[2], d)
     if not z > 0.0:
         return False
     x, y = dot(axes[0], d), dot(axes[1], d)
-    radius = math.sqrt(x * x + y * y)
-    c1, s1 = (x / radius, y / radius) if radius > 0.0 else (1.0, 0.0)
+    square = x * x + y * y
+    scale = 1.0 / math.sqrt(square) if square > 0.0 else 0.0
+    # Powers of e^(i phi), four at a time: a chain of single ones would wait for each.
+    c1, s1 = np.float32(x * scale), np.float32(y * scale)
+    c2, s2 = c1 * c1 - s1 * s1, np.float32(2.0) * c1 * s1
+    c4, s4 = c2 * c2 - s2 * s2, np.float32(2.0) * c2 * s2
+    c, s = out[0], out[1]
+    c[0], c[1], c[2], c[3] = np.float32(1.0), c1, c2, c2 * c1 - s2 * s1
+    s[0], s[1], s[2], s[3] = np.float32(0.0), s1, s2, c2 * s1 + s2 * c1
+    for m in range(4, _ROW_0):
+        c[m] = c[m - 4] * c4 - s[m - 4] * s4
+        s[m] = c[m - 4] * s4 + s[m - 4] * c4
+    for m in range(_ROW_1):
+        c[_ROW_0 + m], s[_ROW_0 + m] = c[m], s[m]
+    for m in range(_ROW_2):
+        c[_ROW_0 + _ROW_1 + m], s[_ROW_0 + _ROW_1 + m] = c[m], s[m]
     place = min(max(math.sqrt(max(0.0, 1.0 - z)) * POLAR - 0.5, 0.0), POLAR - 1.001)
     g = int(place)
     f = np.float32(place - g)
-    c, s = 1.0, 0.0
-    for m in range(highest + 1):
-        circle[0, m], circle[1, m] = c, s
-        c, s = c * c1 - s * s1, c * s1 + s * c1
-    terms = len(order)
-    for k in range(terms):
-        out[0, k] = circle[0, order[k]]
-        out[1, k] = circle[1, order[k]]
-    for k in range(terms):
-        value = factor[g, k] + f * (factor[g + 1, k] - factor[g, k])
-        out[0, k] *= value
-        out[1, k] *= value
+    low, high = factor[g], factor[g + 1]
+    for k in range(len(low)):
+        value = low[k] + f * (high[k] - low[k])
+        c[k] *= value
+        s[k] *= value
     return True
 
 
@@ -164,7 +158,7 @@ def send_lobe(wave, gathered):  # type: ignore[no-untyped-def]
     """Specular exit radiance without its colour, of view factors `wave` (2, K) and what was `gathered` (6, K); what
     truncation puts below zero is cut off."""
     red = green = blue = np.float32(0.0)
-    for k in range(MOST_TERMS):
+    for k in range(TERMS):
         red += wave[0, k] * gathered[0, k] + wave[1, k] * gathered[3, k]
         green += wave[0, k] * gathered[1, k] + wave[1, k] * gathered[4, k]
         blue += wave[0, k] * gathered[2, k] + wave[1, k] * gathered[5, k]
@@ -182,7 +176,12 @@ def axes_of(n):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sky_lobes(words, normals, material, factors, directions, flux, resolution, cells, out, row):  # type: ignore[no-untyped-def]
     side = resolution // cells
-    wave, circle = np.empty((2, MOST_TERMS), np.float32), np.empty((2, MOST_ORDERS), np.float32)
+    width = min(side, 8)  # texels of a cell in one byte
+    mask = np.uint8((1 << width) - 1)
+    ones = np.zeros(256, np.int64)
+    for value in range(1, 256):
+        ones[value] = ones[value >> 1] + (value & 1)
+    wave = np.empty((2, TERMS), np.float32)
     for i in range(len(words)):
         if row[i] < 0:
             continue
@@ -195,11 +194,11 @@ def _sky_lobes(words, normals, material, factors, directions, flux, resolution, 
             seen = 0
             for a in range(side):
                 t = (face * resolution + r * side + a) * resolution + column * side
-                for b in range(t, t + side):
-                    seen += (words[i, b >> 3] >> np.uint8(b & 7)) & np.uint8(1)
+                for b in range(t, t + side, width):
+                    seen += ones[(words[i, b >> 3] >> np.uint8(b & 7)) & mask]
             if seen == 0:
                 continue
             d = (directions[c, 0], directions[c, 1], directions[c, 2])
-            if waves(factors.light_factor[m], factors.order[m], factors.highest[m], axes, d, circle, wave):
+            if waves(factors.light_factor[m], axes, d, wave):
                 share = np.float32(seen / (side * side))
                 gather_lobe(wave, share * flux[c, 0], share * flux[c, 1], share * flux[c, 2], out[row[i]])

@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.brdf.models import MaterialTable, dot, lobes_and_density
-from relightcli.core.brdf.separable import MOST_ORDERS, MOST_TERMS
+from relightcli.core.brdf.separable import TERMS
 from relightcli.core.shade.gather import in_parts
 from relightcli.core.shade.lobe_factors import LobeFactors, axes_of, gather_lobe, waves
 from relightcli.core.sphere.lattice import r2_point
@@ -91,7 +91,7 @@ def local_lobes(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _gather_points(bits, lights, positions, normals, material, factors, points, out, row):  # type: ignore[no-untyped-def]
-    wave, circle = np.empty((2, MOST_TERMS), np.float32), np.empty((2, MOST_ORDERS), np.float32)
+    wave = np.empty((2, TERMS), np.float32)
     for i in range(len(bits)):
         if row[i] < 0:
             continue
@@ -103,7 +103,7 @@ def _gather_points(bits, lights, positions, normals, material, factors, points, 
                 continue
             u1, u2 = r2_point(k)
             d, _, radiance, density = sample_light(lights, p, u1, u2)
-            if waves(factors.light_factor[m], factors.order[m], factors.highest[m], axes, d, circle, wave):
+            if waves(factors.light_factor[m], axes, d, wave):
                 w = 1.0 / (density * points)
                 red, green, blue = np.float32(w * radiance[0]), np.float32(w * radiance[1]), np.float32(w * radiance[2])
                 gather_lobe(wave, red, green, blue, out[row[i]])

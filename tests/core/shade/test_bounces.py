@@ -7,7 +7,7 @@ import pytest
 
 from relightcli.adapters.rays import Tracer
 from relightcli.core.brdf.models import lobes, pack_materials, widen
-from relightcli.core.brdf.separable import MOST_TERMS
+from relightcli.core.brdf.separable import TERMS
 from relightcli.core.shade.bounces import Exit, bounce
 from relightcli.core.shade.gather import build_gather, join
 from relightcli.core.shade.lobe_factors import lobe_factors, lobe_rows
@@ -42,7 +42,7 @@ class Stage:
         self.row = lobe_rows(self.material, self.factors)
 
     def exit(self, diffuse):
-        lobe = np.zeros((int(self.row.max()) + 1, 6, MOST_TERMS), np.float32)
+        lobe = np.zeros((int(self.row.max()) + 1, 6, TERMS), np.float32)
         return Exit(np.broadcast_to(np.asarray(diffuse, np.float32), (len(self.row), 3)).copy(), lobe, self.row)
 
     def bounce(self, light, view=None, active=None, go_on=False):
@@ -196,7 +196,7 @@ def test_lobe_towards_the_camera(material):
 @pytest.mark.parametrize("material", SHINY, ids=lambda m: m.model)
 def test_lobes_between_receivers(material):
     # What a shiny square sends on, against lobes evaluated in full: gather at every receiver, then towards each that
-    # sees it. Factors leave out up to 10 % of a lobe (a third for the narrow ones), most of it finer than this light.
+    # sees it. Factors leave out a tenth of these lobes, most of it finer than this light.
     positions, normals, faces = facing_squares(0.5, 6)
     stage = Stage(positions, normals, faces, material)
     rng = np.random.default_rng(7)
