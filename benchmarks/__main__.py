@@ -16,7 +16,17 @@ from typing import Any
 
 from benchmarks import report
 
-NAMES = ("visibility", "picture", "mitsuba", "sh_transfer", "sky_matrix", "store", "accuracy", "brdf")
+NAMES = (
+    "visibility",
+    "picture",
+    "mitsuba",
+    "sh_transfer",
+    "sky_matrix",
+    "store",
+    "accuracy",
+    "interreflections",
+    "brdf",
+)
 PACKAGES = ("relightcli", "numpy", "numba", "zarr", "embreex", "mitsuba", "pyradiance")
 RESULTS = Path("build/bench.json")
 

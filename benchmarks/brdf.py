@@ -10,7 +10,6 @@ factors it finds, but they lie in the span of the HOSVD's. A row compares with H
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -21,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.report import Report, Row, Table
-from benchmarks.scenes import Setting, shared_data
+from benchmarks.scenes import Setting
 
 N_H = (1, 2, 3, 4, 5, 6)
 N_I = (4, 8, 12, 16, 20, 24, 28, 32)
@@ -132,13 +131,14 @@ def plot(path: Path, found: dict[str, dict[str, Curves]], views: Sequence[int], 
 def measure(setting: Setting) -> Report:
     from relightcli.core.brdf.basis import brdf_basis
     from relightcli.core.brdf.dataset import BLINN_PHONG_EXPONENTS, BrdfSet, blinn_phong_set, cook_torrance_set
+    from relightcli.core.brdf.measured import fits
     from relightcli.core.brdf.specular_lobes import LOBES, MIRROR, fit_lobes, lobes_on_grid
     from relightcli.core.compress.tucker import hooi
 
     resolution = 12 if setting.quick else 32
     entries, views = (QUICK_N_H, QUICK_N_I) if setting.quick else (N_H, N_I)
     ranks = [(n_h, n) for n in views for n_h in entries]
-    points, origin = _measured_points()
+    points = [(fit.f0, fit.roughness) for fit in fits()]
     exponents = BLINN_PHONG_EXPONENTS[::20] if setting.quick else BLINN_PHONG_EXPONENTS
     points = points[::5] if setting.quick else points
 
@@ -146,8 +146,8 @@ def measure(setting: Setting) -> Report:
     grid: list[tuple[str | int | float, ...]] = []
     seconds: list[tuple[str | int | float, ...]] = []
     report = Report(
-        f"Cook-Torrance: {len(points)} {origin}; Blinn-Phong: {len(exponents)} exponents 1 to {exponents[-1]}; disc of "
-        f"{resolution} x {resolution}"
+        f"Cook-Torrance: {len(points)} fits to measured materials [Ngan 2005]; "
+        f"Blinn-Phong: {len(exponents)} exponents 1 to {exponents[-1]}; disc of {resolution} x {resolution}"
     )
     for name in ("Cook-Torrance", "Blinn-Phong"):
         clock = time.perf_counter()

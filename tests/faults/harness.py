@@ -15,7 +15,8 @@ from pathlib import Path
 
 import relight_formats as formats
 
-PRECOMPUTE = ("precompute", "scene.toml", "--light-resolution", "256", "--refine", "8", "--no-subdivide")
+BOUNCES = ("--bounces", "1", "--bounce-resolution", "8")
+PRECOMPUTE = ("precompute", "scene.toml", "--light-resolution", "256", "--refine", "8", "--no-subdivide", *BOUNCES)
 WORKERS = ("--workers", "2")
 # What tells when and how fast a store was made; everything else must be the same bytes after any interruption.
 TIMED = ("zarr.json", "ledger/zarr.json")

@@ -31,12 +31,31 @@ class Gather(NamedTuple):
     solid_angle: NDArray[np.float32]
 
 
+class _Tables(NamedTuple):
+    """moment (6 R R, 4) float32: direction times solid angle, and solid angle, of every texel; whole (6 C C, 4): their
+    sums over every cell; center (6 C C, 3): unit; reach (6 C C,): how far from it the cell's texels are."""
+
+    moment: NDArray[np.float32]
+    whole: NDArray[np.float32]
+    center: NDArray[np.float32]
+    reach: NDArray[np.float32]
+
+
 @lru_cache(maxsize=2)
-def _texel_moments(resolution: int) -> NDArray[np.float32]:
-    """(6 R R, 4) float32: integral of the direction over every texel (at its centre), and its solid angle."""
-    directions = cube.texel_directions(resolution).reshape(-1, 3)
-    solid = np.tile(cube.solid_angles(resolution).reshape(-1), 6)[:, None]
-    return np.concatenate([directions * solid, solid], axis=1).astype(np.float32)
+def _tables(resolution: int, cells: int) -> _Tables:
+    side = resolution // cells
+    directions = cube.texel_directions(resolution)
+    solid = np.tile(cube.solid_angles(resolution), (6, 1, 1))[..., None]
+    moment = np.concatenate([directions * solid, solid], axis=3)
+    center = cube.texel_directions(cells)
+    inside = directions.reshape(6, cells, side, cells, side, 3)
+    reach = np.linalg.norm(inside - center[:, :, None, :, None], axis=5).max(axis=(2, 4))
+    return _Tables(
+        moment.reshape(-1, 4).astype(np.float32),
+        moment.reshape(6, cells, side, cells, side, 4).sum(axis=(2, 4)).reshape(-1, 4).astype(np.float32),
+        center.reshape(-1, 3).astype(np.float32),
+        (reach.reshape(-1) * (1.0 + 1e-5) + 1e-6).astype(np.float32),  # covers the rounding to float32
+    )
 
 
 def build_gather(
@@ -57,11 +76,11 @@ def build_gather(
         np.empty(z, np.float32),
     )
     words = np.ascontiguousarray(bits).reshape(len(bits), -1)
-    moments = _texel_moments(resolution)
+    tables = _tables(resolution, cells)
     normals = np.ascontiguousarray(normals, np.float32)
 
     def part(a: int, b: int) -> None:
-        _weigh(flat[a:b], words[a:b], normals[a:b], moments, resolution, start[a:b], out)
+        _weigh(flat[a:b], words[a:b], normals[a:b], tables, resolution, start[a:b], out)
 
     in_parts(part, len(hits), threads)
     return out
@@ -90,9 +109,11 @@ def in_parts(work: Callable[[int, int], None], count: int, threads: int) -> None
 
 
 @njit(cache=True, nogil=True)
-def _weigh(flat, words, normals, moments, resolution, start, out):  # type: ignore[no-untyped-def]
+def _weigh(flat, words, normals, tables, resolution, start, out):  # type: ignore[no-untyped-def]
     cells = out.cells
     side = resolution // cells
+    width = min(side, 8)  # texels of a cell in one byte
+    mask = np.uint8((1 << width) - 1)
     for i in range(len(flat)):
         z = start[i]
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
@@ -100,15 +121,24 @@ def _weigh(flat, words, normals, moments, resolution, start, out):  # type: igno
             if flat[i, c] == 0:
                 continue
             face, row, column = c // (cells * cells), (c // cells) % cells, c % cells
-            w = s = np.float32(0.0)
+            first = (face * resolution + row * side) * resolution + column * side
+            seen = np.uint8(0)
             for a in range(side):
-                t = (face * resolution + row * side + a) * resolution + column * side
-                for b in range(t, t + side):
-                    if (words[i, b >> 3] >> np.uint8(b & 7)) & np.uint8(1):
-                        continue
-                    height = nx * moments[b, 0] + ny * moments[b, 1] + nz * moments[b, 2]
-                    if height > np.float32(0.0):
-                        w += height
-                        s += moments[b, 3]
+                for t in range(first + a * resolution, first + a * resolution + side, width):
+                    seen |= (words[i, t >> 3] >> np.uint8(t & 7)) & mask
+            o, m = tables.center[c], tables.whole[c]
+            w = s = np.float32(0.0)
+            if seen == 0 and nx * o[0] + ny * o[1] + nz * o[2] > tables.reach[c]:  # all above the horizon and blocked
+                w, s = nx * m[0] + ny * m[1] + nz * m[2], m[3]
+            else:
+                for a in range(side):
+                    for t in range(first + a * resolution, first + a * resolution + side):
+                        if (words[i, t >> 3] >> np.uint8(t & 7)) & np.uint8(1):
+                            continue
+                        q = tables.moment[t]
+                        height = nx * q[0] + ny * q[1] + nz * q[2]
+                        if height > np.float32(0.0):
+                            w += height
+                            s += q[3]
             out.source[z], out.cell[z], out.cosine[z], out.solid_angle[z] = flat[i, c] - 1, c, w, s
             z += 1

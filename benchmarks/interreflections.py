@@ -1,0 +1,127 @@
+"""Interreflections against path tracing: scenes in which light bounces, edited after the simulation, by layer.
+
+Errors are relative RMS over the whole picture, shadow edges and outlines included. The path tracer's noise is not
+counted: with two independent references A and B, the mean of (ours - A)(ours - B) is free of it.
+"""
+
+from __future__ import annotations
+
+import statistics
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.bounce_scenes import MAKERS, write
+from benchmarks.processes import run_tool
+from benchmarks.report import Report, Row, Table
+from benchmarks.scenes import Setting
+
+BOUNCES = 2
+LAYERS = ("", "direct", "one_bounce", "two_bounce")
+LIMIT = {False: 3.0, True: 6.0}  # %, diffuse and glossy scenes
+FLIP_LIMIT = 0.05
+REPEATS = 3
+Picture = dict[str, NDArray[np.float32]]
+
+
+def read(path: Path) -> Picture:
+    """RGB of the beauty ("") and of every layer."""
+    from relightcli.adapters.images import read_image
+
+    image = read_image(path)
+    at = {name: image.pixels[..., k] for k, name in enumerate(image.names)}
+    return {name: np.stack([at[f"{name}.{c}" if name else c] for c in "RGB"], axis=-1) for name in LAYERS}
+
+
+def error(ours: NDArray[np.float32], a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
+    """Relative RMS of ours in %, without the noise of the references a and b."""
+    x, y, z = (p.astype(np.float64) for p in (ours, a, b))
+    return 100.0 * float(np.sqrt(max(0.0, np.mean((x - y) * (x - z)) / np.mean(y * z))))
+
+
+def skies(work: Path) -> dict[str, Path]:
+    from relightcli.adapters.images import write_image
+    from relightcli.core.lights.sky import sky_latlong
+
+    out = {"overcast": work / "overcast.exr", "sun": work / "sun.exr"}
+    write_image(out["overcast"], sky_latlong(45.0, overcast=True))
+    write_image(out["sun"], sky_latlong(40.0, 150.0))
+    return out
+
+
+def measure(setting: Setting) -> Report:
+    from relightcli.adapters.flip import flip_hdr
+
+    size, spp, cells = ((40, 30), 8, 8) if setting.quick else ((160, 120), 256, 24)
+    maps = skies(setting.work)
+    report = Report(f"{BOUNCES} interreflections, {size[0]}x{size[1]}, references of {2 * spp} samples a pixel")
+    table: list[tuple[str | int | float, ...]] = []
+    costs: list[tuple[str | int | float, ...]] = []
+    for make in MAKERS[:1] if setting.quick else MAKERS:
+        scene = make(cells)
+        if scene is None:
+            report.skipped.append(f"{make.__name__}: no test data")
+            continue
+        folder = setting.work / make.__name__
+        path = write(scene, folder, size)
+        store = folder / "transfer.zarr"
+        _, made = run_tool("precompute", path, "-o", store, "--bounces", str(BOUNCES), *setting.options)
+        edit = [word for change in scene.edit for word in ("--set", change)]
+        for sky, environment in maps.items():
+            common = (store, "--env", environment, "--layers", *edit)
+            outputs = [folder / f"{sky}-{k}.exr" for k in ("ours", "a", "b")]
+            run_tool("relight", *common, "-o", outputs[0])
+            for seed in (0, 1):
+                more = ("--reference", "--spp", str(spp), "--seed", str(seed))
+                run_tool("relight", *common, "-o", outputs[1 + seed], *more)
+            ours, a, b = (read(p) for p in outputs)
+            found = [error(ours[name], a[name], b[name]) for name in LAYERS]
+            flip = float(flip_hdr(ours[""], 0.5 * (a[""] + b[""])).mean())
+            means = [float(ours[n].mean() / (0.5 * (a[n] + b[n])).mean()) for n in LAYERS[1:]]
+            kind = "glossy" if scene.glossy else "diffuse"
+            table.append((scene.name, kind, sky, *found, flip, *means))
+            limit = LIMIT[scene.glossy]
+            work = f"{scene.name}, {sky}"
+            report.rows.append(
+                Row(f"{work}: {scene.about}", found[0], "%", target=f"<= {limit:g} %", met=found[0] <= limit)
+            )
+            met = flip <= FLIP_LIMIT
+            report.rows.append(Row(f"{work}: FLIP", flip, "", target=f"<= {FLIP_LIMIT}", met=met))
+        costs.append(
+            (scene.name, made["receivers"], made["bytes"] / 1e6, made["seconds"], *_frames(store, maps["sun"]))
+        )
+    columns = ("scene", "kind", "sky", "error, %", *(f"{n}, %" for n in LAYERS[1:]), "FLIP")
+    report.tables.append(
+        Table(
+            "error by layer after the edit, and the layers' means relative to the references'",
+            (*columns, *(f"mean {n}" for n in LAYERS[1:])),
+            tuple(table),
+        )
+    )
+    report.tables.append(
+        Table(
+            "cost; a frame is a new sky, lit and assembled",
+            ("scene", "receivers", "MB", "precompute, s", "s a frame, direct", "s a frame, two bounces"),
+            tuple(costs),
+        )
+    )
+    return report
+
+
+def _frames(store: Path, environment: Path) -> tuple[float, float]:
+    """Seconds a frame of a turning sky, without interreflections and with them."""
+    shots = store.parent / "shots.toml"
+    shots.write_text(
+        f"format = 1\nframes = {REPEATS + 1}\n[[key]]\nframe = 1\nenv = '{environment}'\nenv_rotate = 0\n"
+        "[[key]]\nframe = 5\nenv_rotate = 100\n"
+    )
+    out: list[float] = []
+    for bounces in (0, BOUNCES):
+        _, told = run_tool(
+            "relight", store, "--frames", shots, "-o", store.parent / "f##.exr", "--bounces", str(bounces)
+        )
+        told_frames: list[Any] = told["frame_seconds"]
+        out.append(statistics.median(told_frames[1:]))  # the first reads the store
+    return out[0], out[1]
