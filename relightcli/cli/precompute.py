@@ -45,7 +45,10 @@ from relightcli.cli import options
 @click.option("--sh-order", default=6, show_default=True, help="Bands of the spherical harmonics.")
 @click.option("--bounces", default=None, type=int, help="Interreflections. Default: what --effects names, 0 with auto.")
 @click.option(
-    "--bounce-resolution", default=16, show_default=True, help="Cells along a cube face through which light bounces."
+    "--bounce-resolution",
+    default=None,
+    type=int,
+    help="Cells along a cube face through which light bounces: 8, 16 (default) or 32.",
 )
 @click.option("--seed", default=0, type=options.SEED, show_default=True, help="Seed of the random checks.")
 @click.option("--allow-outside", is_flag=True, help="Let the scene file use files outside its folder.")

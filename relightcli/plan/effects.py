@@ -56,7 +56,7 @@ def bounces_asked(asked: tuple[str, ...] | None, bounces: int | None) -> int:
     named = max((BOUNCES.get(name, 0) for name in asked or ()), default=0)
     if bounces is None:
         return named
-    if asked is not None and min(bounces, 2) != named:
+    if asked not in (None, AVAILABLE) and min(bounces, 2) != named:
         raise InputError(
             f"--bounces {bounces}: --effects names {named or 'no'} bounces; expected the same (one-bounce, "
             "two-bounce), or --effects auto"

@@ -294,19 +294,20 @@ class LightingStore:
     def _gather(self) -> Gather | None:
         """Who sees whom; None where nothing blocks anything. Raises StoreError if that was not simulated."""
         if "bounce/hit" not in self.store:
-            if "shadows" not in self.store.settings["effects"]:
+            if self.store.attrs["nothing_blocks"]:
                 return None
             raise StoreError(
                 f"{self.store.path}: holds direct light only; precompute with --bounces 1 or more, or use --reference"
             )
         if self._gathered is None:
-            array: Any = self.store.array("bounce/hit")
-            self._gathered = join(
-                [
-                    build_gather(np.asarray(array[rows]), bits, self.normal[rows], self.threads)
-                    for rows, bits in self.blocks()
-                ]
-            )
+            hits: Any = self.store.array("bounce/hit")
+            parts = []
+            for block, bits in self.blocks():
+                for start in range(block.start, block.stop, self._chunk):
+                    rows = slice(start, min(start + self._chunk, block.stop))
+                    seen = bits[start - block.start : rows.stop - block.start]
+                    parts.append(build_gather(np.asarray(hits[rows]), seen, self.normal[rows], self.threads))
+            self._gathered = join(parts)
         return self._gathered
 
     def _tint(self) -> NDArray[np.float32] | None:

@@ -42,6 +42,7 @@ KIND = "transfer"
 BASES = ("visibility", "haar", "sh", "dense")
 PILOT_GROUPS = 24  # groups of receivers that a dry run traces
 MOST_BOUNCES = 64
+BOUNCE_RESOLUTIONS = (8, 16, 32)
 WRONG_BITS = 1e-3  # share of wrong bits above which the user is told
 
 
@@ -61,7 +62,7 @@ class Config:
     tolerance: float | None = None
     sh_order: int = 6
     bounces: int | None = None
-    bounce_resolution: int = 16
+    bounce_resolution: int | None = None
     seed: int = 0
     workers: int = 1
     overwrite: bool = False
@@ -90,7 +91,9 @@ def precompute(config: Config) -> dict[str, Any]:
     plan = effects.decide(asked, geometry.positions, geometry.faces, bool(both.any()), _lobes(scene), bounces)
     simulated = [d.effect for d in plan if d.simulate]
     shadows = "shadows" in simulated
-    bounce_cells = config.bounce_resolution if "one-bounce" in simulated else 0
+    bounce_cells = 0
+    if "one-bounce" in simulated:
+        bounce_cells = config.bounce_resolution or (8 if config.light_resolution % 16 else 16)
     source = geometry
     if shadows and config.subdivide and config.receivers == "vertices":
         geometry = _subdivided(geometry)
@@ -129,6 +132,7 @@ def precompute(config: Config) -> dict[str, Any]:
             {
                 "scene": scene_to_json(scene, geometry),
                 "plan": [{"effect": d.effect, "simulate": d.simulate, "evidence": d.evidence} for d in plan],
+                "nothing_blocks": asked is None and not shadows,
             }
         )
         put_geometry(writer, geometry)
@@ -195,9 +199,9 @@ def _check_bounces(config: Config) -> None:
     if config.receivers != "vertices":
         raise InputError("--receivers pixels: interreflections need vertices to bounce off; use --receivers vertices")
     cells = config.bounce_resolution
-    if cells not in (8, 16, 32, 64) or config.light_resolution % cells:
+    if cells is not None and (cells not in BOUNCE_RESOLUTIONS or config.light_resolution % cells):
         raise InputError(
-            "--bounce-resolution: expected 8, 16, 32 or 64, and a divisor of --light-resolution "
+            "--bounce-resolution: expected 8, 16 or 32, and a divisor of --light-resolution "
             f"({config.light_resolution}); found {cells}"
         )
 

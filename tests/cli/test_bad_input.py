@@ -108,7 +108,7 @@ def test_meshes(here, refused, content, words):
         (("--bounces", "65"), ("--bounces", "0 to 64", "found 65")),
         (("--bounces", "x"), ("--bounces", "'x' is not a valid integer")),
         (("--bounces", "1", "--effects", "direct,shadows"), ("--bounces 1", "--effects names no bounces")),
-        (("--bounces", "1", "--bounce-resolution", "12"), ("--bounce-resolution", "8, 16, 32 or 64", "found 12")),
+        (("--bounces", "1", "--bounce-resolution", "12"), ("--bounce-resolution", "8, 16 or 32", "found 12")),
         (("--bounces", "1", "--receivers", "pixels:main"), ("--receivers pixels", "use --receivers vertices")),
         (("--workers", "0"), ("--workers", "0 is not in the range")),
         (("--workers", "100000"), ("--workers", "is not in the range")),

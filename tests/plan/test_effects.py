@@ -108,6 +108,8 @@ def test_lobes_are_told():
         ("auto", 3, 3),
         ("all", None, 2),
         ("all", 5, 5),
+        ("all", 1, 1),
+        ("all", 0, 0),
         ("direct,shadows", None, 0),
         ("direct,shadows", 0, 0),
         ("direct,shadows,one-bounce", None, 1),
@@ -120,7 +122,7 @@ def test_number_of_bounces(effects, bounces, expected):
 
 
 @pytest.mark.parametrize(
-    ("effects", "bounces"), [("direct,shadows", 1), ("direct,shadows,one-bounce", 2), ("all", 0), ("all", 1)]
+    ("effects", "bounces"), [("direct,shadows", 1), ("direct,shadows,one-bounce", 2), ("direct,shadows,one-bounce", 0)]
 )
 def test_names_and_number_must_agree(effects, bounces):
     with pytest.raises(InputError, match=f"--bounces {bounces}: --effects names"):

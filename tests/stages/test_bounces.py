@@ -7,10 +7,12 @@ import pytest
 
 import relight_formats as formats
 from relightcli.core.measure.errors import relative_rmse
+from relightcli.errors import StoreError
 from relightcli.scene.model import Camera, Material
 from relightcli.stages.relight import Config, relight
 from tests.core.shade.skies import smooth_map
-from tests.core.transport.scenes import lambert, sphere, sphere_grid, square
+from tests.core.transport.scenes import Part, lambert, sphere, sphere_grid, square
+from tests.core.transport.test_buried import box
 from tests.stages.scene_files import make_store, read_layers, write_scene
 
 CAMERA = Camera("main", (0.4, 1.3, 2.6), (0, 0.4, 0), fov=38, size=(64, 48))
@@ -125,8 +127,8 @@ def test_linear_in_the_light(store, scene):
     for name in ("one_bounce", "two_bounce"):
         assert lamp[name].mean() > 0
         expected = found["smooth"][name] + 2 * found["patchy"][name] - 2 * lamp[name]
-        # Truncated lobes are cut at zero, which is not linear: a few vertices of the gold ball's surroundings.
-        assert relative_rmse(both[name], expected) < 5e-3
+        # Sums below zero are cut off, which is not linear: a few vertices around the gold ball.
+        assert relative_rmse(both[name], expected) < 2e-3
 
 
 def test_reference_takes_the_stores_bounces(store):
@@ -189,6 +191,34 @@ def test_extreme_materials(store, roughness, f0):
         assert layers[name].min() >= 0
         # No more than a white world would send: the sky and the lamp are below 10.
         assert layers[name].max() < 10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cells", [8, 16, 32])
+def test_mirrors_neither_make_nor_lose_light(tmp_path, cells):
+    # A closed box of mirrors with a lamp, against the path tracer: the picture's sharpness is lost, not its light.
+    # Means of whole layers; 4,096 samples on 256 pixels leave them uncertain by less than 1 %.
+    material = Material("m", "cook-torrance", (0.1, 0.1, 0.1), (0.8, 0.8, 0.8), f0=1.0, roughness=0.1)
+    walls = box((-1, -1, -1), (1, 1, 1), 10)
+    start = np.cumsum([0] + [len(p) for p, _ in walls])
+    corners = np.concatenate([p for p, _ in walls])
+    triangles = np.concatenate([f[:, ::-1] + s for (_, f), s in zip(walls, start[:-1], strict=True)])
+    room = Part(corners, triangles, material=material)
+    camera = Camera("main", (0.2, 0.1, 0.9), (0, 0, -1), fov=80, size=(16, 16))
+    lamp = "[lights.lamp]\nshape = 'sphere'\ncenter = [0.1, 0.3, 0]\nradius = 0.2\nradiance = [10, 10, 10]\n"
+    scene = write_scene(tmp_path, {"room": room}, [camera], {"sky": np.zeros((4, 8, 3))}, more=lamp)
+    store = make_store(scene, bounces=3, bounce_resolution=cells, workers=2)
+    a = layers_of(store, "a.exr", env="sky")
+    b = layers_of(store, "b.exr", env="sky", reference=True, spp=4096)
+    for name in ("direct", "one_bounce", "two_bounce", "three_bounce"):
+        # At 8 cells a side the lamp's reflection in a wall is smaller than a cell.
+        assert a[name].mean() == pytest.approx(b[name].mean(), rel=0.12 if cells == 8 else 0.03), name
+
+
+def test_a_store_without_shadows_knows_of_no_interreflections(scene, tmp_path):
+    store = make_store(scene, "plain.zarr", effects="direct", light_resolution=16, refine=2)
+    with pytest.raises(StoreError, match="holds direct light only"):
+        layers_of(store, "a.exr", bounces=1)
 
 
 def test_two_sided_and_translucent(tmp_path):

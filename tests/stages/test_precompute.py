@@ -195,7 +195,7 @@ def test_summary_agrees_with_the_store(scene, tmp_path):
         ({"coefficients": 0}, "--coefficients: expected 1 to 1536; found 0"),
         ({"basis": "sh", "sh_order": 17}, "--sh-order: expected 1 to 16; found 17"),
         ({"bounces": 65}, "--bounces: expected 0 to 64; found 65"),
-        ({"bounces": 1, "light_resolution": 24}, "--bounce-resolution: .* \\(24\\); found 16"),
+        ({"bounces": 1, "light_resolution": 24, "bounce_resolution": 16}, "--bounce-resolution: .* \\(24\\); found 16"),
         ({"effects": "magic"}, "--effects: .* found 'magic'"),
         ({"receivers": "texels"}, "--receivers: expected vertices or pixels:CAMERA; found 'texels'"),
         ({"receivers": "pixels:side"}, "has no camera 'side'; it has: main"),

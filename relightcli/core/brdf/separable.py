@@ -10,9 +10,10 @@ sin sin, every term of order m > 0 is a pair of functions on either side, and pa
 both directions about the normal changes nothing.
 
 Kept are, for every lobe alike so that loops over them are short and of fixed length, the strongest products of the
-orders below ROWS[0], the second strongest of those below ROWS[1], and so on. What this leaves out of rough lobes is a
-few percent of their norm, of those near the size of a cell most of it, that is their sharpness:
-`tests/core/brdf/test_separable.py` has the numbers.
+orders below ROWS[0], the second strongest of those below ROWS[1], and four more of order 0, which holds the lobe's
+energy. What this leaves out of rough lobes is some percent of their norm, of narrow ones most of it, that is their
+sharpness; lobes at least LEAST_WIDTH wide keep their energy to a percent up to 60 degrees, to 5 % beyond
+(tests/core/brdf/test_separable.py). A truncated lobe has places below zero, which belong to its energy.
 """
 
 from __future__ import annotations
@@ -28,8 +29,9 @@ from relightcli.core.brdf.models import lobes_and_density
 
 POLAR = 48  # samples of theta, even in p = sqrt(1 - cos theta) from 0 to 1, which goes nearly with theta
 AZIMUTHS = 128  # samples of phi from 0 to 360 degrees
-ROWS = (14, 7, 3)  # orders of the first, second, third product
+ROWS = (14, 6, 1, 1, 1, 1)  # orders of the first, second, ... product; from the third on order 0 alone
 TERMS = sum(ROWS)
+LEAST_WIDTH = 0.2  # radians in directions of light: narrower lobes have more than the terms can hold
 
 
 class Separable(NamedTuple):

@@ -9,7 +9,7 @@ with L the exit radiance of the interreflection before, diffuse and specular. An
 Nothing of light or materials is baked in, so both change freely; what is lost is the size of a cell.
 
 Specular light that goes on to other receivers takes the short cut of `brdf.separable`: every shiny receiver gathers
-what arrives, once per light factor, and sends it on weighted by the view factors. Its lobes are widened to a cell.
+what arrives, once per light factor, and sends it on weighted by the view factors.
 """
 
 from __future__ import annotations
@@ -135,7 +135,8 @@ def _bounce(  # type: ignore[no-untyped-def]
                 sb += s * b
             if go_on and waves(factors.light_factor[m], axes, d, wave):
                 gather_lobe(wave, w * r, w * g, w * b, lobe_out[row[i]])
-        irradiance[i, 0], irradiance[i, 1], irradiance[i, 2] = er, eg, eb
-        specular[i, 0] = sr * factors.colour[m, 0]
-        specular[i, 1] = sg * factors.colour[m, 1]
-        specular[i, 2] = sb * factors.colour[m, 2]
+        # Truncated lobes may leave a little below zero, in sums as well.
+        irradiance[i, 0], irradiance[i, 1], irradiance[i, 2] = max(er, 0.0), max(eg, 0.0), max(eb, 0.0)
+        specular[i, 0] = max(sr, 0.0) * factors.colour[m, 0]
+        specular[i, 1] = max(sg, 0.0) * factors.colour[m, 1]
+        specular[i, 2] = max(sb, 0.0) * factors.colour[m, 2]

@@ -1,7 +1,7 @@
 """Specular light between receivers: what arrives is gathered once per light factor, and sent on by the view factors.
 
-The factors are those of `brdf.separable`, of lobes that are widened to the size of a cell: narrower ones could not be
-told from the pattern of the cells.
+The factors are those of `brdf.separable`, of lobes that are widened to what the factors can hold, which is also more
+than a cell: narrower lobes could not be told from the pattern of the cells.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from relightcli.core.brdf.models import (
     SPECULAR,
     MaterialTable,
     dot,
+    widen,
 )
 from relightcli.core.brdf.sampling import orthonormal_frame
-from relightcli.core.brdf.separable import POLAR, ROWS, TERMS, separate
+from relightcli.core.brdf.separable import LEAST_WIDTH, POLAR, ROWS, TERMS, separate
 from relightcli.core.lights.environment import SkyCube
 from relightcli.core.shade.gather import in_parts
 from relightcli.core.sphere import cube
@@ -39,7 +40,8 @@ class LobeFactors(NamedTuple):
 
 
 def lobe_factors(table: MaterialTable) -> LobeFactors:
-    """Factors of every material with a specular lobe that is not black. Lobes narrower than a cell must be widened."""
+    """Factors of every material with a specular lobe that is not black, widened to LEAST_WIDTH if need be."""
+    table = widen(table, LEAST_WIDTH)
     m = len(table.model)
     out = LobeFactors(
         np.zeros(m, bool),
@@ -100,7 +102,7 @@ def sky_lobes(
 
 # Order of sums is free, so that loops over the terms become vector instructions.
 FAST = {"reassoc", "contract", "nsz"}
-_ROW_0, _ROW_1, _ROW_2 = ROWS
+_ROW_0, _ROW_1 = ROWS[:2]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
@@ -127,8 +129,8 @@ def waves(factor, axes, d, out):  # type: ignore[no-untyped-def]
         s[m] = c[m - 4] * s4 + s[m - 4] * c4
     for m in range(_ROW_1):
         c[_ROW_0 + m], s[_ROW_0 + m] = c[m], s[m]
-    for m in range(_ROW_2):
-        c[_ROW_0 + _ROW_1 + m], s[_ROW_0 + _ROW_1 + m] = c[m], s[m]
+    for k in range(_ROW_0 + _ROW_1, TERMS):
+        c[k], s[k] = np.float32(1.0), np.float32(0.0)
     place = min(max(math.sqrt(max(0.0, 1.0 - z)) * POLAR - 0.5, 0.0), POLAR - 1.001)
     g = int(place)
     f = np.float32(place - g)
@@ -155,15 +157,16 @@ def gather_lobe(wave, red, green, blue, out):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
 def send_lobe(wave, gathered):  # type: ignore[no-untyped-def]
-    """Specular exit radiance without its colour, of view factors `wave` (2, K) and what was `gathered` (6, K); what
-    truncation puts below zero is cut off."""
+    """Specular exit radiance without its colour, of view factors `wave` (2, K) and what was `gathered` (6, K).
+
+    Truncated lobes have places below zero. They stay, or the light would grow with every interreflection.
+    """
     red = green = blue = np.float32(0.0)
     for k in range(TERMS):
         red += wave[0, k] * gathered[0, k] + wave[1, k] * gathered[3, k]
         green += wave[0, k] * gathered[1, k] + wave[1, k] * gathered[4, k]
         blue += wave[0, k] * gathered[2, k] + wave[1, k] * gathered[5, k]
-    zero = np.float32(0.0)
-    return max(red, zero), max(green, zero), max(blue, zero)
+    return red, green, blue
 
 
 @njit(cache=True, nogil=True)

@@ -5,9 +5,9 @@ at once. A receiver whose rays end in next to nothing steps aside, onto one of i
 
 A floor's vertex below a table's foot gets no light; interpolated, it would darken the floor around the foot. Such a
 receiver is found by a few rays: it is buried if none of them leaves the scene, and either each ends closer than the
-receiver's neighbours on the mesh or on the back of a one-sided surface, or most of them end on backs, inside something.
-It moves along its vertex's faces to the nearest place that is not buried, and speaks for the vertex from there. Where
-there is none, the face's other corners stand in.
+receiver's nearest neighbour on the mesh or on the back of a one-sided surface, or most of them end on backs, inside
+something. It moves along its vertex's faces to the nearest place that is not buried, and speaks for the vertex from
+there. Where there is none, the face's other corners stand in.
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relightcli.core.sphere.lattice import r2_point
-from relightcli.core.transport.receivers import Receivers
+from relightcli.core.transport.receivers import Receivers, receivers_of_vertices
 
 FIRST, ALL = 8, 56  # rays of every receiver, and of those whose first ones all end on something
 INSIDE = 0.5  # share of rays that end on backs, from which a point counts as inside
 TOUCHING = 1 / 256  # of the distance to the neighbours: rays that end closer have hardly begun
 ASIDE = 1 / 64  # of the way to a face's opposite edge
+HALFWAY = 8 / 16
 STEPS = (1 / 16, 2 / 16, 3 / 16, 4 / 16, 6 / 16, 8 / 16, 12 / 16, 15 / 16)  # of the way to a face's opposite edge
 BATCH = 1 << 16
 
@@ -58,7 +59,7 @@ def unbury(
 
     positions (V, 3), faces (F, 3); face_normals (F, 3) of the counter-clockwise sides; two_sided (F,).
     """
-    reach = _edge_lengths(positions, faces)[receivers.vertex]
+    reach = _shortest_edges(positions, faces)[receivers.vertex]
     place = receivers.position.copy()
     touching = _touching(tracer, place, receivers.normal, reach)
     # Corners of faces by vertex: vertex v's are corner[first[v]] to corner[first[v + 1]].
@@ -76,6 +77,9 @@ def unbury(
     buried = find_buried(tracer, place, receivers.normal, reach, face_normals, two_sided)
     for step in STEPS:
         left = np.flatnonzero(buried)
+        if step != HALFWAY:
+            # Where all neighbours are buried too, one try is enough: deep inside there is no way out.
+            left = left[_rim(faces, receivers, buried)[left]]
         vertex = receivers.vertex[left]
         count = first[vertex + 1] - first[vertex]
         who = np.repeat(left, count)
@@ -88,6 +92,16 @@ def unbury(
         place[moved] = there[free][chosen]
         buried[moved] = False
     return replace(receivers, position=place), buried
+
+
+def _rim(faces: NDArray[np.int32], receivers: Receivers, buried: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Receivers (N,) with a neighbour on the same side that is not buried."""
+    out = np.zeros(len(buried), bool)
+    for index in receivers_of_vertices(receivers.vertex, receivers.side, int(faces.max(initial=-1)) + 1):
+        corner = index[faces]
+        corner = corner[(corner >= 0).all(axis=1)]
+        out[corner[(~buried[corner]).any(axis=1)]] = True
+    return out
 
 
 def _touching(
@@ -112,7 +126,7 @@ def find_buried(
     face_normals: NDArray[np.float32],
     two_sided: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
-    """Which points (N,) are buried. positions, normals (N, 3); reach (N,), the distance to their neighbours."""
+    """Which points (N,) are buried. positions, normals (N, 3); reach (N,), the distance to their nearest neighbour."""
     buried = np.ones(len(positions), bool)
     for first, last in ((0, FIRST), (FIRST, ALL)):
         index = np.flatnonzero(buried)
@@ -152,12 +166,11 @@ def _tangents(n: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.f
     return s, t
 
 
-def _edge_lengths(positions: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Mean length of the edges at every vertex, (V,); 0 where there are none."""
-    total, count = np.zeros(len(positions)), np.zeros(len(positions))
+def _shortest_edges(positions: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Length of the shortest edge at every vertex, (V,); infinite where there are none."""
+    out = np.full(len(positions), np.inf)
     for a, b in ((0, 1), (1, 2), (2, 0)):
         length = np.linalg.norm(positions[faces[:, a]] - positions[faces[:, b]], axis=1)
         for corner in (a, b):
-            total += np.bincount(faces[:, corner], length, len(positions))
-            count += np.bincount(faces[:, corner], minlength=len(positions))
-    return total / np.maximum(count, 1.0)
+            np.minimum.at(out, faces[:, corner], length)
+    return out

@@ -7,7 +7,7 @@ import pytest
 
 from relightcli.adapters.rays import Tracer
 from relightcli.core.brdf.models import lobes, pack_materials, widen
-from relightcli.core.brdf.separable import TERMS
+from relightcli.core.brdf.separable import LEAST_WIDTH, TERMS
 from relightcli.core.shade.bounces import Exit, bounce
 from relightcli.core.shade.gather import build_gather, join
 from relightcli.core.shade.lobe_factors import lobe_factors, lobe_rows
@@ -206,12 +206,14 @@ def test_lobes_between_receivers(material):
     directions = cube.texel_directions(C).reshape(-1, 3)
     gather = stage.gather
 
+    wide = widen(stage.table, LEAST_WIDTH)
+
     def sent(y, towards):
         total = 0.0
         n = tuple(stage.receivers.normal[y].astype(float))
         for z in range(gather.start[y], gather.start[y + 1]):
             d = tuple(directions[gather.cell[z]])
-            s = lobes(stage.table.model[0], stage.table.parameters[0], n, d, tuple(towards))[1]
+            s = lobes(wide.model[0], wide.parameters[0], n, d, tuple(towards))[1]
             total += s * gather.solid_angle[z] * light.diffuse[gather.source[z], 0]
         return total
 
