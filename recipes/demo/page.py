@@ -77,11 +77,11 @@ def animation_uri(frames: list[Path]) -> str:
 def check_section(folder: Path, log: Path, sky: str) -> Section:
     result = answer(log, f"diff-{sky}")
     item, limits = result["items"][0], result["fail"]
-    relit, reference = (read_image(folder / f"{kind}-{sky}.exr").pixels[..., :3] for kind in ("small", "reference"))
+    relit, reference = (read_image(folder / f"{name}.exr").pixels[..., :3] for name in (sky, f"reference-{sky}"))
     # One exposure for both, that the brighter parts of the reference come out near white.
     exposure = float(-np.log2(np.quantile(reference, 0.98)))
     pictures = [
-        Picture(png_data_uri(to_display(relit, exposure)), f"From the store: {command(log, f'small-{sky}')}"),
+        Picture(png_data_uri(to_display(relit, exposure)), f"From the store: {command(log, f'exr-{sky}')}"),
         Picture(png_data_uri(to_display(reference, exposure)), f"Path-traced: {command(log, f'reference-{sky}')}"),
         Picture(
             picture_uri(folder / f"heatmap-{sky}.png"),
@@ -102,7 +102,7 @@ def times_section(
     log: Path, store: dict[str, Any], skies: list[str], checked: list[str], turntable: dict[str, Any]
 ) -> Section:
     names = [f"{kind}-{s}" for s in skies for kind in ("exr", "png")]
-    names += ["turntable", *(f"{kind}-{s}" for s in checked for kind in ("small", "reference"))]
+    names += ["turntable", *(f"reference-{s}" for s in checked)]
     rows: list[list[str | float]] = [[command(log, "precompute"), store["summary"]["seconds"]]]
     rows += [[command(log, name), answer(log, name)["seconds"]] for name in names]
     lit = turntable["lighting_seconds"]

@@ -8,7 +8,19 @@ from typing import Any
 import relight_formats as formats
 from relightcli.errors import StoreError
 
-SUMMED = ("seconds", "cpu_seconds", "trace_seconds", "rays", "bytes", "checked", "wrong", "inferred", "bits")
+SUMMED = (
+    "seconds",
+    "cpu_seconds",
+    "trace_seconds",
+    "bounce_seconds",
+    "rays",
+    "bounce_rays",
+    "bytes",
+    "checked",
+    "wrong",
+    "inferred",
+    "bits",
+)
 
 
 def inspect(path: Path, verify: bool) -> dict[str, Any]:

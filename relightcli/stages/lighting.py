@@ -301,10 +301,11 @@ class LightingStore:
             )
         if self._gathered is None:
             hits: Any = self.store.array("bounce/hit")
+            step = len(self) if self.store.layouts["bounce/hit"].raw_bytes <= IN_MEMORY else self._chunk
             parts = []
             for block, bits in self.blocks():
-                for start in range(block.start, block.stop, self._chunk):
-                    rows = slice(start, min(start + self._chunk, block.stop))
+                for start in range(block.start, block.stop, step):
+                    rows = slice(start, min(start + step, block.stop))
                     seen = bits[start - block.start : rows.stop - block.start]
                     parts.append(build_gather(np.asarray(hits[rows]), seen, self.normal[rows], self.threads))
             self._gathered = join(parts)

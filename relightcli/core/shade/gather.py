@@ -32,11 +32,12 @@ class Gather(NamedTuple):
 
 
 class _Tables(NamedTuple):
-    """moment (6 R R, 4) float32: direction times solid angle, and solid angle, of every texel; whole (6 C C, 4): their
-    sums over every cell; center (6 C C, 3): unit; reach (6 C C,): how far from it the cell's texels are."""
+    """moment (6 R R, 4) float32: direction times solid angle, and solid angle, of every texel; blocked (6 R R / 4, 16,
+    4): their sums over those of four texels in a row whose bit in a number from 0 to 15 is 0; center (6 C C, 3): unit;
+    reach (6 C C,): how far from it the cell's texels are."""
 
     moment: NDArray[np.float32]
-    whole: NDArray[np.float32]
+    blocked: NDArray[np.float32]
     center: NDArray[np.float32]
     reach: NDArray[np.float32]
 
@@ -46,13 +47,14 @@ def _tables(resolution: int, cells: int) -> _Tables:
     side = resolution // cells
     directions = cube.texel_directions(resolution)
     solid = np.tile(cube.solid_angles(resolution), (6, 1, 1))[..., None]
-    moment = np.concatenate([directions * solid, solid], axis=3)
+    moment = np.concatenate([directions * solid, solid], axis=3).reshape(-1, 4)
+    clear = 1.0 - (np.arange(16)[:, None] >> np.arange(4) & 1)  # (16, 4): texels whose bit is 0
     center = cube.texel_directions(cells)
     inside = directions.reshape(6, cells, side, cells, side, 3)
     reach = np.linalg.norm(inside - center[:, :, None, :, None], axis=5).max(axis=(2, 4))
     return _Tables(
-        moment.reshape(-1, 4).astype(np.float32),
-        moment.reshape(6, cells, side, cells, side, 4).sum(axis=(2, 4)).reshape(-1, 4).astype(np.float32),
+        moment.astype(np.float32),
+        np.ascontiguousarray(clear @ moment.reshape(-1, 4, 4), np.float32),
         center.reshape(-1, 3).astype(np.float32),
         (reach.reshape(-1) * (1.0 + 1e-5) + 1e-6).astype(np.float32),  # covers the rounding to float32
     )
@@ -112,8 +114,7 @@ def in_parts(work: Callable[[int, int], None], count: int, threads: int) -> None
 def _weigh(flat, words, normals, tables, resolution, start, out):  # type: ignore[no-untyped-def]
     cells = out.cells
     side = resolution // cells
-    width = min(side, 8)  # texels of a cell in one byte
-    mask = np.uint8((1 << width) - 1)
+    fours = side % 4 == 0
     for i in range(len(flat)):
         z = start[i]
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
@@ -122,23 +123,27 @@ def _weigh(flat, words, normals, tables, resolution, start, out):  # type: ignor
                 continue
             face, row, column = c // (cells * cells), (c // cells) % cells, c % cells
             first = (face * resolution + row * side) * resolution + column * side
-            seen = np.uint8(0)
-            for a in range(side):
-                for t in range(first + a * resolution, first + a * resolution + side, width):
-                    seen |= (words[i, t >> 3] >> np.uint8(t & 7)) & mask
-            o, m = tables.center[c], tables.whole[c]
+            o = tables.center[c]
             w = s = np.float32(0.0)
-            if seen == 0 and nx * o[0] + ny * o[1] + nz * o[2] > tables.reach[c]:  # all above the horizon and blocked
-                w, s = nx * m[0] + ny * m[1] + nz * m[2], m[3]
+            if fours and nx * o[0] + ny * o[1] + nz * o[2] > tables.reach[c]:  # all of the cell is above the horizon
+                x = y = v = np.float32(0.0)
+                for a in range(first, first + side * resolution, resolution):
+                    for t in range(a, a + side, 4):
+                        m = tables.blocked[t >> 2, (words[i, t >> 3] >> np.uint8(t & 4)) & np.uint8(15)]
+                        x += m[0]
+                        y += m[1]
+                        v += m[2]
+                        s += m[3]
+                w = nx * x + ny * y + nz * v
             else:
-                for a in range(side):
-                    for t in range(first + a * resolution, first + a * resolution + side):
+                for a in range(first, first + side * resolution, resolution):
+                    for t in range(a, a + side):
                         if (words[i, t >> 3] >> np.uint8(t & 7)) & np.uint8(1):
                             continue
-                        q = tables.moment[t]
-                        height = nx * q[0] + ny * q[1] + nz * q[2]
+                        m = tables.moment[t]
+                        height = nx * m[0] + ny * m[1] + nz * m[2]
                         if height > np.float32(0.0):
                             w += height
-                            s += q[3]
+                            s += m[3]
             out.source[z], out.cell[z], out.cosine[z], out.solid_angle[z] = flat[i, c] - 1, c, w, s
             z += 1

@@ -7,39 +7,17 @@ geometry only: every further sky reuses it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.transport.camera import Film, film_direction
+from relightcli.core.transport.tracer import Tracer
 
 BASE_GRID = 1  # samples along a pixel's side; receivers' light is smooth between them
 EDGE_GRID = 6  # the same where the picture has an edge
 TEXTURE_GRID = 3  # the least where surfaces have textures
-
-
-class Hits(Protocol):
-    @property
-    def face(self) -> NDArray[np.int32]: ...
-    @property
-    def u(self) -> NDArray[np.float32]: ...
-    @property
-    def v(self) -> NDArray[np.float32]: ...
-    @property
-    def distance(self) -> NDArray[np.float32]: ...
-
-
-class NearestTracer(Protocol):
-    """What this module needs of a ray tracer."""
-
-    center: NDArray[np.float64]
-    scale: float
-
-    def to_local(self, points: NDArray[np.floating[Any]]) -> NDArray[np.float32]: ...
-
-    def intersect(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> Hits: ...
 
 
 @dataclass(frozen=True)
@@ -68,7 +46,7 @@ def face_normals(positions: NDArray[np.float64], faces: NDArray[np.int32]) -> ND
 
 
 def see(
-    tracer: NearestTracer,
+    tracer: Tracer,
     film: Film,
     face_object: NDArray[np.int32],
     face_normals: NDArray[np.float32],
@@ -115,7 +93,7 @@ class _Shots:
     distance: NDArray[np.float32]
 
 
-def _shoot(tracer: NearestTracer, film: Film, pixels: NDArray[np.int64], grid: int) -> _Shots:
+def _shoot(tracer: Tracer, film: Film, pixels: NDArray[np.int64], grid: int) -> _Shots:
     count = len(pixels) * grid * grid
     pixel = np.repeat(pixels, grid * grid)
     direction = np.empty((count, 3), np.float32)

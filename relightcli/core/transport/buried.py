@@ -12,14 +12,18 @@ there. Where there is none, the face's other corners stand in.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
+from relightcli.core.brdf.sampling import about
 from relightcli.core.sphere.lattice import r2_point
 from relightcli.core.transport.receivers import Receivers, receivers_of_vertices
+from relightcli.core.transport.tracer import Tracer
 
 FIRST, ALL = 8, 56  # rays of every receiver, and of those whose first ones all end on something
 INSIDE = 0.5  # share of rays that end on backs, from which a point counts as inside
@@ -30,25 +34,8 @@ STEPS = (1 / 16, 2 / 16, 3 / 16, 4 / 16, 6 / 16, 8 / 16, 12 / 16, 15 / 16)  # of
 BATCH = 1 << 16
 
 
-class Hits(Protocol):
-    @property
-    def face(self) -> NDArray[np.int32]: ...
-    @property
-    def distance(self) -> NDArray[np.float32]: ...
-
-
-class NearestTracer(Protocol):
-    """What this module needs of a ray tracer."""
-
-    scale: float
-
-    def offset(self, points: NDArray[np.floating[Any]], normals: NDArray[np.floating[Any]]) -> NDArray[np.float32]: ...
-
-    def intersect(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> Hits: ...
-
-
 def unbury(
-    tracer: NearestTracer,
+    tracer: Tracer,
     receivers: Receivers,
     positions: NDArray[np.float64],
     faces: NDArray[np.int32],
@@ -105,7 +92,7 @@ def _rim(faces: NDArray[np.int32], receivers: Receivers, buried: NDArray[np.bool
 
 
 def _touching(
-    tracer: NearestTracer, positions: NDArray[np.float64], normals: NDArray[np.float32], reach: NDArray[np.float64]
+    tracer: Tracer, positions: NDArray[np.float64], normals: NDArray[np.float32], reach: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
     """Points (N,) from which a ray ends at once."""
     out = np.zeros(len(positions), bool)
@@ -119,7 +106,7 @@ def _touching(
 
 
 def find_buried(
-    tracer: NearestTracer,
+    tracer: Tracer,
     positions: NDArray[np.float64],
     normals: NDArray[np.float32],
     reach: NDArray[np.float64],
@@ -146,24 +133,20 @@ def find_buried(
     return buried
 
 
-def _directions(normals: NDArray[np.float32], first: int, last: int) -> NDArray[np.float32]:
+@njit(cache=True)
+def _directions(normals: Any, first: int, last: int) -> Any:
     """Directions `first` to `last` of a fixed set about every normal, distributed as the cosine, (N * count, 3)."""
-    points = np.array([r2_point(k) for k in range(first, last)])
-    radius, angle = np.sqrt(points[:, 0]), 2.0 * np.pi * points[:, 1]
-    x, y, z = radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1.0 - points[:, 0])
-    s, t = _tangents(normals.astype(np.float64))
-    out = x[None, :, None] * s[:, None] + y[None, :, None] * t[:, None] + z[None, :, None] * normals[:, None, :]
-    return np.ascontiguousarray(out.reshape(-1, 3), np.float32)
-
-
-def _tangents(n: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Two unit vectors (N, 3) each that complete unit normals (N, 3) to right-handed frames. [Duff 2017, listing 3]"""
-    sign = np.copysign(1.0, n[:, 2])
-    a = -1.0 / (sign + n[:, 2])
-    b = n[:, 0] * n[:, 1] * a
-    s = np.stack([1.0 + sign * n[:, 0] ** 2 * a, sign * b, -sign * n[:, 0]], axis=1)
-    t = np.stack([b, sign + n[:, 1] ** 2 * a, -n[:, 1]], axis=1)
-    return s, t
+    out = np.empty((len(normals) * (last - first), 3), np.float32)
+    row = 0
+    for i in range(len(normals)):
+        n = (np.float64(normals[i, 0]), np.float64(normals[i, 1]), np.float64(normals[i, 2]))
+        for k in range(first, last):
+            u1, u2 = r2_point(k)
+            radius, angle = math.sqrt(u1), 2.0 * math.pi * u2
+            d = about(n, radius * math.cos(angle), radius * math.sin(angle), math.sqrt(1.0 - u1))
+            out[row, 0], out[row, 1], out[row, 2] = d
+            row += 1
+    return out
 
 
 def _shortest_edges(positions: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:

@@ -10,32 +10,16 @@ make up the hemisphere, whatever C is.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.sphere import cube
+from relightcli.core.transport.tracer import Tracer
 
 BATCH = 256  # receivers whose rays are traced together
-
-
-class Hits(Protocol):
-    @property
-    def face(self) -> NDArray[np.int32]: ...
-    @property
-    def u(self) -> NDArray[np.float32]: ...
-    @property
-    def v(self) -> NDArray[np.float32]: ...
-
-
-class NearestTracer(Protocol):
-    """What this module needs of a ray tracer."""
-
-    def offset(self, points: NDArray[np.floating[Any]], normals: NDArray[np.floating[Any]]) -> NDArray[np.float32]: ...
-
-    def intersect(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> Hits: ...
 
 
 class Surfaces(NamedTuple):
@@ -56,7 +40,7 @@ class Surfaces(NamedTuple):
 
 
 def trace_hits(
-    tracer: NearestTracer,
+    tracer: Tracer,
     surfaces: Surfaces,
     positions: NDArray[np.float64],
     normals: NDArray[np.float32],

@@ -6,8 +6,6 @@ to be kept. A bit is 1 where the point is above the horizon, emits towards the r
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -15,24 +13,10 @@ from numpy.typing import NDArray
 from relightcli.core.brdf.models import dot
 from relightcli.core.sphere.lattice import r2_point
 from relightcli.core.transport.local_lights import LocalLights, sample_light
+from relightcli.core.transport.tracer import Tracer
 
 POINTS_PER_LIGHT = 128
 SHORTENED = 1.0 - 1e-4  # rays end before their light: what touches it from behind must not block it
-
-
-class DistanceTracer(Protocol):
-    """What this module needs of a ray tracer."""
-
-    scale: float
-
-    def offset(self, points: NDArray[np.floating], normals: NDArray[np.floating]) -> NDArray[np.float32]: ...
-
-    def occluded(
-        self,
-        origins: NDArray[np.float32],
-        directions: NDArray[np.float32],
-        max_distance: NDArray[np.float32] | None = None,
-    ) -> NDArray[np.bool_]: ...
 
 
 def point_count(lights: LocalLights) -> int:
@@ -41,7 +25,7 @@ def point_count(lights: LocalLights) -> int:
 
 
 def light_bits(
-    tracer: DistanceTracer | None,
+    tracer: Tracer | None,
     lights: LocalLights,
     positions: NDArray[np.float64],
     normals: NDArray[np.float32],

@@ -12,7 +12,6 @@ cut into rows, passes or processes.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,40 +22,11 @@ from relightcli.core.transport import estimators
 from relightcli.core.transport.camera import Film, approach, make_film
 from relightcli.core.transport.local_lights import LIGHT_CLEARANCE
 from relightcli.core.transport.shading import ShadingScene, surface_at
+from relightcli.core.transport.tracer import Tracer
 from relightcli.scene.model import Camera
 
 # Paths in flight: 700 bytes each; larger batches are no faster.
 BATCH = 1 << 16
-
-
-class HitsLike(Protocol):
-    """Nearest hits: face (N,) int32, -1 for none; u, v, distance (N,) float32 (distance in the tracer's frame)."""
-
-    @property
-    def face(self) -> NDArray[np.int32]: ...
-    @property
-    def u(self) -> NDArray[np.float32]: ...
-    @property
-    def v(self) -> NDArray[np.float32]: ...
-    @property
-    def distance(self) -> NDArray[np.float32]: ...
-
-
-class TracerLike(Protocol):
-    """The part of `relightcli.adapters.rays.Tracer` that is used."""
-
-    center: NDArray[np.float64]
-    scale: float
-
-    def to_local(self, points: NDArray[np.floating[Any]]) -> NDArray[np.float32]: ...
-    def offset(self, points: NDArray[np.floating[Any]], normals: NDArray[np.floating[Any]]) -> NDArray[np.float32]: ...
-    def occluded(
-        self,
-        origins: NDArray[np.float32],
-        directions: NDArray[np.float32],
-        max_distance: NDArray[np.float32] | None = None,
-    ) -> NDArray[np.bool_]: ...
-    def intersect(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> HitsLike: ...
 
 
 @dataclass(frozen=True)
@@ -124,7 +94,7 @@ def resolve(tile: Tile) -> Picture:
 
 def trace_rows(
     scene: ShadingScene,
-    tracer: TracerLike,
+    tracer: Tracer,
     environment: LatLong,
     camera: Camera,
     rows: tuple[int, int],
@@ -179,7 +149,7 @@ class _Paths:
 
 def _trace_paths(
     scene: ShadingScene,
-    tracer: TracerLike,
+    tracer: Tracer,
     environment: LatLong,
     film: Film,
     paths: _Paths,

@@ -11,26 +11,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Protocol
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.sphere import cube
+from relightcli.core.transport.tracer import Tracer
 
 GROUP = 16  # receivers that share their refinement
 CHECKS = 16  # texels per receiver whose inferred value is checked by a ray
 
 BELOW, BLOCKED, OPEN = 0, 1, 2  # state of a probe
-
-
-class OcclusionTracer(Protocol):
-    """What this module needs of a ray tracer."""
-
-    def offset(self, points: NDArray[np.floating], normals: NDArray[np.floating]) -> NDArray[np.float32]: ...
-
-    def occluded(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.bool_]: ...
 
 
 @dataclass(frozen=True)
@@ -79,7 +71,7 @@ def horizon_bits(normals: NDArray[np.float32], resolution: int) -> NDArray[np.ui
 
 
 def trace_visibility(
-    tracer: OcclusionTracer,
+    tracer: Tracer,
     positions: NDArray[np.float64],
     normals: NDArray[np.float32],
     resolution: int,
@@ -106,7 +98,7 @@ def trace_visibility(
 
 
 def _trace_batch(
-    tracer: OcclusionTracer,
+    tracer: Tracer,
     origins: NDArray[np.float32],
     normals: NDArray[np.float32],
     resolution: int,
@@ -161,7 +153,7 @@ def _trace_batch(
 
 
 def _trace_cells(
-    tracer: OcclusionTracer,
+    tracer: Tracer,
     origins: NDArray[np.float32],
     normals: NDArray[np.float32],
     tables: _Tables,
