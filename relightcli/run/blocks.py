@@ -103,9 +103,9 @@ def run_blocks(
 
 
 def _drain(pool: Executor, job: Job, todo: list[Block], finish: Callable[[Block, Info], None]) -> list[Block]:
-    futures: Mapping[Future[Info], Block] = {pool.submit(_run, job, block): block for block in todo}
-    pending = set(futures)
     try:
+        futures = _hand_in(pool, job, todo)
+        pending = set(futures)
         while pending:
             done, pending = wait(pending, return_when=FIRST_COMPLETED)
             for future in done:
@@ -116,6 +116,15 @@ def _drain(pool: Executor, job: Job, todo: list[Block], finish: Callable[[Block,
         pool.shutdown(wait=True, cancel_futures=True)
         raise
     return []
+
+
+def _hand_in(pool: Executor, job: Job, todo: list[Block]) -> Mapping[Future[Info], Block]:
+    """Submits the blocks. Workers start meanwhile; an interrupt waits until they know that it is not theirs."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        return {pool.submit(_run, job, block): block for block in todo}
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
 def _pool(workers: int) -> ProcessPoolExecutor:
@@ -132,6 +141,7 @@ def _pool(workers: int) -> ProcessPoolExecutor:
 def _start_worker(parent: int) -> None:
     """A worker leaves interrupts to its parent and does not outlive it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # it came blocked
     signal.signal(signal.SIGTERM, _leave_worker)
     # The parent says what went wrong; zarr's event loop would complain about every chunk beside it.
     logging.getLogger("asyncio").disabled = True

@@ -135,7 +135,7 @@ def test_rerun_of_a_finished_store(here, capsys):
     [
         (("--seed", "1"), "seed: 0 there, 1 asked for"),
         (("--light-resolution", "128"), "light_resolution: 256 there, 128 asked for"),
-        (("--receivers", "pixels:main"), 'receivers: "vertices" there, "pixels:main" asked for'),
+        (("--bounces", "0", "--receivers", "pixels:main"), 'receivers: "vertices" there, "pixels:main" asked for'),
         ("ball.obj", "input ball.obj"),
         ("scene.toml", "input scene.toml"),
     ],
