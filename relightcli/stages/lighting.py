@@ -5,27 +5,26 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import relight_formats as formats
 from relightcli.core.brdf.models import SPECULAR, MaterialTable, pack_materials, widen
-from relightcli.core.brdf.separable import TERMS
 from relightcli.core.lights.environment import SkyCube, latlong_to_cube, splat
-from relightcli.core.shade.bounces import Exit, bounce
-from relightcli.core.shade.gather import Gather, build_gather, join
 from relightcli.core.shade.glossy import sky_tree, specular_radiance
 from relightcli.core.shade.irradiance import irradiance, moment_prefix
-from relightcli.core.shade.lobe_factors import lobe_factors, lobe_rows, sky_lobes
-from relightcli.core.shade.local import local_lobes, local_radiance
+from relightcli.core.shade.local import local_radiance
 from relightcli.core.sphere import haar, sh
 from relightcli.core.transport.local_lights import pack_lights
 from relightcli.core.transport.receivers import receivers_of_vertices
 from relightcli.errors import InputError, StoreError
 from relightcli.scene.describe import scene_from_json
 from relightcli.scene.model import Geometry, Material, Scene
+
+if TYPE_CHECKING:
+    from relightcli.core.shade.gather import Gather
 
 IN_MEMORY = 1 << 30  # visibility up to this size stays in memory between frames
 BLACK = (0.0, 0.0, 0.0)
@@ -249,6 +248,11 @@ class LightingStore:
         bounces: int,
     ) -> Iterator[Radiance]:
         """Exit radiance after each of `bounces` interreflections of the directly lit receivers."""
+        # Loaded here: pictures of direct light need not wait for them.
+        from relightcli.core.brdf.separable import TERMS
+        from relightcli.core.shade.bounces import Exit, bounce
+        from relightcli.core.shade.lobe_factors import lobe_factors, lobe_rows, local_lobes, sky_lobes
+
         table = widen(coats.table, 0.5 * np.pi / gather.cells)
         factors = lobe_factors(table)
         row = lobe_rows(coats.material, factors)
@@ -300,6 +304,8 @@ class LightingStore:
                 f"{self.store.path}: holds direct light only; precompute with --bounces 1 or more, or use --reference"
             )
         if self._gathered is None:
+            from relightcli.core.shade.gather import build_gather, join
+
             hits: Any = self.store.array("bounce/hit")
             step = len(self) if self.store.layouts["bounce/hit"].raw_bytes <= IN_MEMORY else self._chunk
             parts = []

@@ -9,9 +9,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.brdf.models import MaterialTable, dot, lobes_and_density
-from relightcli.core.brdf.separable import TERMS
-from relightcli.core.shade.gather import in_parts
-from relightcli.core.shade.lobe_factors import LobeFactors, axes_of, gather_lobe, waves
 from relightcli.core.sphere.lattice import r2_point
 from relightcli.core.transport.light_visibility import point_count
 from relightcli.core.transport.local_lights import LocalLights, sample_light
@@ -58,55 +55,6 @@ def local_radiance(
     with ThreadPoolExecutor(max(1, threads)) as pool:
         list(pool.map(part, cuts[:-1], cuts[1:]))
     return irradiance, specular
-
-
-def local_lobes(
-    bits: NDArray[np.uint8],
-    lights: LocalLights,
-    positions: NDArray[np.float64],
-    normals: NDArray[np.float32],
-    material: NDArray[np.int32],
-    factors: LobeFactors,
-    out: NDArray[np.float32],
-    row: NDArray[np.int32],
-    threads: int = 1,
-) -> None:
-    """Adds to `out` (G, 6, K) what shiny receivers, at `row` (N,), gather of the lights per light factor."""
-
-    def part(a: int, b: int) -> None:
-        _gather_points(
-            bits[a:b],
-            lights,
-            positions[a:b],
-            normals[a:b].astype(np.float64),
-            material[a:b],
-            factors,
-            point_count(lights),
-            out,
-            row[a:b],
-        )
-
-    in_parts(part, len(bits), threads)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _gather_points(bits, lights, positions, normals, material, factors, points, out, row):  # type: ignore[no-untyped-def]
-    wave = np.empty((2, TERMS), np.float32)
-    for i in range(len(bits)):
-        if row[i] < 0:
-            continue
-        p = (positions[i, 0], positions[i, 1], positions[i, 2])
-        axes = axes_of((normals[i, 0], normals[i, 1], normals[i, 2]))
-        m = material[i]
-        for k in range(points):
-            if not (bits[i, k >> 3] >> np.uint8(k & 7)) & np.uint8(1):
-                continue
-            u1, u2 = r2_point(k)
-            d, _, radiance, density = sample_light(lights, p, u1, u2)
-            if waves(factors.light_factor[m], axes, d, wave):
-                w = 1.0 / (density * points)
-                red, green, blue = np.float32(w * radiance[0]), np.float32(w * radiance[1]), np.float32(w * radiance[2])
-                gather_lobe(wave, red, green, blue, out[row[i]])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
