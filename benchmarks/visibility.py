@@ -31,7 +31,7 @@ class Recorder:
         return offset
 
     def occluded(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.bool_]:
-        self.rays.append((origins, directions))
+        self.rays.append((origins.copy(), directions.copy()))  # their arrays are used again
         blocked: NDArray[np.bool_] = self.tracer.occluded(origins, directions)
         return blocked
 

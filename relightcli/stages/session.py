@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -60,10 +61,14 @@ class Session:
         self._radiance: list[NDArray[np.float32]] = []
 
     def write(self, shot: Shot, suffix: str) -> str:
-        environment = self._environment(shot)
         materials = apply_settings(self.lighting.scene.materials, shot.settings)
         if suffix in PICTURES:
-            return self._write_picture(shot, suffix, environment, materials)
+            with ThreadPoolExecutor(1) as reader:  # the map is read while the view is made
+                reading = reader.submit(self._environment, shot)
+                view = self._view(shot.camera)
+                environment = reading.result()
+            return self._write_picture(shot, suffix, view, environment, materials)
+        environment = self._environment(shot)
         towards = None
         if self.lighting.scene.cameras:
             eye = np.array(resolve_camera(shot.camera, self.lighting.scene.cameras).eye)
@@ -137,9 +142,8 @@ class Session:
         return _View(camera, matrix, samples.coverage, matrix.used(len(lighting)), towards)
 
     def _write_picture(
-        self, shot: Shot, suffix: str, environment: NDArray[np.float32], materials: dict[str, Material]
+        self, shot: Shot, suffix: str, view: _View, environment: NDArray[np.float32], materials: dict[str, Material]
     ) -> str:
-        view = self._view(shot.camera)
         width, height = view.camera.size
         parts = self._light(shot, environment, materials, view.towards, view.active)
         threads = self.config.workers

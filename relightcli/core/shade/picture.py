@@ -61,26 +61,58 @@ def vertex_matrix(
     buried (N,): receivers that the face's others stand in for."""
     seen = lit_surface(geometry, samples)
     sample = seen.path
-    face = samples.face[sample]
-    corner = geometry.faces[face]
-    # The side is the one that `lit_surface` chose: a second test against the ray could round to the other one.
-    facing = np.einsum("nx,nx->n", face_normals[face], seen.geometric) > 0
-    receiver = np.where(facing[:, None], front[corner], back[corner])
-    u, v = samples.u[sample], samples.v[sample]
-    weight = np.stack([1.0 - u - v, u, v], axis=1)
-    kept = np.where(buried[receiver], 0.0, weight)
-    total = kept.sum(axis=1, keepdims=True)
-    weight = np.where(total > 0, kept / np.where(total > 0, total, 1.0), weight) * samples.weight[sample, None]
+    receiver = np.empty((len(sample), 3), np.int32)
+    weight = np.empty((len(sample), 3), np.float32)
+    _corners(
+        sample,
+        seen.geometric,
+        samples.face,
+        samples.u,
+        samples.v,
+        samples.weight,
+        geometry.faces,
+        face_normals,
+        front,
+        back,
+        buried,
+        receiver,
+        weight,
+    )
     texture = np.zeros((0, 3), np.float32)
     if geometry.textures:
         texture = np.repeat(seen.albedo.astype(np.float32), 3, axis=0)
     start = 3 * np.searchsorted(samples.pixel[sample], np.arange(pixels + 1))
     return PixelMatrix(
         start.astype(np.int64),
-        receiver.reshape(-1).astype(np.int32),
-        weight.reshape(-1).astype(np.float32),
+        receiver.reshape(-1),
+        weight.reshape(-1),
         texture,
     )
+
+
+@njit(cache=True)
+def _corners(  # type: ignore[no-untyped-def]
+    sample, geometric, face, u, v, share, faces, face_normals, front, back, buried, receiver, weight
+):
+    """Receivers at the corners of the faces that samples see, and their barycentric weights times the sample's."""
+    for i in range(len(sample)):
+        s = sample[i]
+        f = face[s]
+        # The side is the one that `lit_surface` chose: a second test against the ray could round to the other one.
+        side = 0.0
+        for x in range(3):
+            side += face_normals[f, x] * geometric[i, x]
+        barycentric = (1.0 - np.float64(u[s]) - np.float64(v[s]), np.float64(u[s]), np.float64(v[s]))
+        kept = 0.0
+        for k in range(3):
+            corner = faces[f, k]
+            receiver[i, k] = front[corner] if side > 0.0 else back[corner]
+            if not buried[receiver[i, k]]:
+                kept += barycentric[k]
+        scale = share[s] / kept if kept > 0.0 else np.float64(share[s])
+        for k in range(3):
+            hidden = kept > 0.0 and buried[receiver[i, k]]
+            weight[i, k] = 0.0 if hidden else barycentric[k] * scale
 
 
 def sample_matrix(

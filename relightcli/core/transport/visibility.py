@@ -45,6 +45,15 @@ class _Tables:
     reach: NDArray[np.float32]  # (cells,) greatest distance from it to the cell's texel directions
 
 
+class _Rays:
+    """Room for the rays of one batch, used again for the next: fresh memory would cost more than filling it."""
+
+    def __init__(self, capacity: int) -> None:
+        self.origins = np.empty((capacity, 3), np.float32)
+        self.directions = np.empty((capacity, 3), np.float32)
+        self.target = np.empty(capacity, np.int32)
+
+
 @lru_cache(maxsize=4)
 def _tables(resolution: int, refine: int) -> _Tables:
     cells = resolution // refine
@@ -88,10 +97,13 @@ def trace_visibility(
     tables = _tables(resolution, refine)
     words = np.zeros((len(positions), 6 * resolution * resolution // 64), np.uint64)
     rays = checked = wrong = inferred = 0
+    room = _Rays(min(batch, len(positions)) * 6 * resolution * resolution)
     for start in range(0, len(positions), batch):
         rows = slice(start, min(start + batch, len(positions)))
         origins = tracer.offset(positions[rows], normals[rows])
-        counts = _trace_batch(tracer, origins, normals[rows], resolution, refine, tables, words[rows], seed + start)
+        counts = _trace_batch(
+            tracer, origins, normals[rows], resolution, refine, tables, words[rows], seed + start, room
+        )
         rays, checked, wrong, inferred = rays + counts[0], checked + counts[1], wrong + counts[2], inferred + counts[3]
     bits = words.view(np.uint8).reshape(len(positions), 6, resolution, resolution // 8)
     return VisibilityBlock(bits, rays, checked, wrong, inferred)
@@ -106,22 +118,32 @@ def _trace_batch(
     tables: _Tables,
     words: NDArray[np.uint64],
     seed: int,
+    room: _Rays,
 ) -> tuple[int, int, int, int]:
     n, cells = len(origins), len(tables.first_texel)
     normals = np.ascontiguousarray(normals, np.float32)
     if refine == 1:
         mark = np.ones((n, cells), np.uint8)
-        traced = _trace_cells(tracer, origins, normals, tables, resolution, refine, mark, words)
+        traced = _trace_cells(tracer, origins, normals, tables, resolution, refine, mark, words, room)
         return traced, 0, 0, 0
 
     # One probe per cell.
-    state = np.zeros((n, cells), np.uint8)
-    ray_origins, ray_directions, owner = _probes(
-        origins, normals, tables.directions, tables.first_texel, tables.centers, tables.reach, resolution, refine, state
+    rays = _probes(
+        origins,
+        normals,
+        tables.directions,
+        tables.first_texel,
+        tables.centers,
+        tables.reach,
+        resolution,
+        refine,
+        room.origins,
+        room.directions,
+        room.target,
     )
-    blocked = tracer.occluded(ray_origins, ray_directions)
-    _store_probes(owner, blocked, state)
-    rays = len(owner)
+    blocked = tracer.occluded(room.origins[:rays], room.directions[:rays])
+    state = np.zeros((n, cells), np.uint8)
+    _store_probes(room.target, blocked, state)
 
     # Cells that disagree with a neighbour, here or at a receiver of the group, are traced; the others are filled.
     mark = _disagreeing(state, tables.neighbours, GROUP)
@@ -137,7 +159,7 @@ def _trace_batch(
         mark,
         words,
     )
-    rays += _trace_cells(tracer, origins, normals, tables, resolution, refine, mark, words)
+    rays += _trace_cells(tracer, origins, normals, tables, resolution, refine, mark, words, room)
 
     # A random sample of what was filled.
     ray_origins, ray_directions, owner, texel = _checks(
@@ -148,7 +170,7 @@ def _trace_batch(
     again = np.zeros_like(mark)
     wrong = _compare(owner, texel, blocked, words, resolution, refine, tables.neighbours, mark, again)
     if wrong:
-        rays += _trace_cells(tracer, origins, normals, tables, resolution, refine, again, words)
+        rays += _trace_cells(tracer, origins, normals, tables, resolution, refine, again, words, room)
     return rays, len(owner), wrong, inferred
 
 
@@ -161,14 +183,26 @@ def _trace_cells(
     refine: int,
     mark: NDArray[np.uint8],
     words: NDArray[np.uint64],
+    room: _Rays,
 ) -> int:
     """Traces every texel above the horizon of the marked cells and writes its bit; returns the number of rays."""
-    ray_origins, ray_directions, owner, texel = _cell_rays(
-        origins, normals, tables.directions, tables.first_texel, resolution, refine, mark
+    count = _cell_rays(
+        origins,
+        normals,
+        tables.directions,
+        tables.first_texel,
+        tables.centers,
+        tables.reach,
+        resolution,
+        refine,
+        mark,
+        room.origins,
+        room.directions,
+        room.target,
     )
-    blocked = tracer.occluded(ray_origins, ray_directions)
-    _write_bits(owner, texel, blocked, words)
-    return len(owner)
+    blocked = tracer.occluded(room.origins[:count], room.directions[:count])
+    _write_bits(room.target, blocked, words.reshape(-1))
+    return count
 
 
 @njit(cache=True)
@@ -190,40 +224,46 @@ def _set_horizon(normals, directions, words):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _probes(origins, normals, directions, first, centers, reach, resolution, refine, state):  # type: ignore[no-untyped-def]
-    n, cells = state.shape
-    capacity = n * cells
-    out_o = np.empty((capacity, 3), np.float32)
-    out_d = np.empty((capacity, 3), np.float32)
-    owner = np.empty(capacity, np.int32)
+def _probes(origins, normals, directions, first, centers, reach, resolution, refine, out_o, out_d, owner):  # type: ignore[no-untyped-def]
+    """One ray for each cell that is not below the horizon; `owner` is its cell among those of all receivers."""
+    n, cells = len(origins), len(first)
     count = 0
     area = refine * refine
     for i in range(n):
         # Odd multiplier: over `area` receivers in a row every place of the cell is probed once.
         place = ((i * 5) + (i // area)) % area
+        usual = (place // refine) * resolution + place % refine
+        x, y, z = origins[i, 0], origins[i, 1], origins[i, 2]
         for c in range(cells):
-            if _height(normals, centers, i, c) < -reach[c]:
+            height = _height(normals, centers, i, c)
+            if height < -reach[c]:
                 continue
             found = -1
-            for k in range(area):
-                p = (place + k) % area
-                t = first[c] + (p // refine) * resolution + p % refine
-                if _above(normals, directions, i, t):
-                    found = t
-                    break
+            if height > reach[c]:  # the whole cell is above the horizon
+                found = first[c] + usual
+            else:
+                for k in range(area):
+                    p = (place + k) % area
+                    t = first[c] + (p // refine) * resolution + p % refine
+                    if _above(normals, directions, i, t):
+                        found = t
+                        break
             if found >= 0:
-                for x in range(3):
-                    out_o[count, x] = origins[i, x]
-                    out_d[count, x] = directions[found, x]
+                out_o[count, 0] = x
+                out_o[count, 1] = y
+                out_o[count, 2] = z
+                out_d[count, 0] = directions[found, 0]
+                out_d[count, 1] = directions[found, 1]
+                out_d[count, 2] = directions[found, 2]
                 owner[count] = i * cells + c
                 count += 1
-    return out_o[:count], out_d[:count], owner[:count]
+    return count
 
 
 @njit(cache=True)
 def _store_probes(owner, blocked, state):  # type: ignore[no-untyped-def]
     flat = state.reshape(-1)
-    for r in range(len(owner)):
+    for r in range(len(blocked)):
         flat[owner[r]] = BLOCKED if blocked[r] else OPEN
 
 
@@ -282,43 +322,42 @@ def _fill(normals, directions, first, centers, reach, resolution, refine, state,
 
 
 @njit(cache=True)
-def _cell_rays(origins, normals, directions, first, resolution, refine, mark):  # type: ignore[no-untyped-def]
+def _cell_rays(origins, normals, directions, first, centers, reach, resolution, refine, mark, out_o, out_d, target):  # type: ignore[no-untyped-def]
+    """Rays of all texels above the horizon of the marked cells; `target` is their bit in the words of all receivers."""
     n, cells = mark.shape
-    capacity = 0
-    for i in range(n):
-        for c in range(cells):
-            capacity += mark[i, c]
-    capacity *= refine * refine
-    out_o = np.empty((capacity, 3), np.float32)
-    out_d = np.empty((capacity, 3), np.float32)
-    owner = np.empty(capacity, np.int32)
-    texel = np.empty(capacity, np.int32)
+    texels = len(directions)
     count = 0
     for i in range(n):
+        x, y, z = origins[i, 0], origins[i, 1], origins[i, 2]
         for c in range(cells):
             if not mark[i, c]:
                 continue
+            height = _height(normals, centers, i, c)
+            if height < -reach[c]:
+                continue
+            whole = height > reach[c]
             for a in range(refine):
-                for b in range(refine):
-                    t = first[c] + a * resolution + b
-                    if _above(normals, directions, i, t):
-                        for x in range(3):
-                            out_o[count, x] = origins[i, x]
-                            out_d[count, x] = directions[t, x]
-                        owner[count] = i
-                        texel[count] = t
+                row = first[c] + a * resolution
+                for t in range(row, row + refine):
+                    if whole or _above(normals, directions, i, t):
+                        out_o[count, 0] = x
+                        out_o[count, 1] = y
+                        out_o[count, 2] = z
+                        out_d[count, 0] = directions[t, 0]
+                        out_d[count, 1] = directions[t, 1]
+                        out_d[count, 2] = directions[t, 2]
+                        target[count] = i * texels + t
                         count += 1
-    return out_o[:count], out_d[:count], owner[:count], texel[:count]
+    return count
 
 
 @njit(cache=True)
-def _write_bits(owner, texel, blocked, words):  # type: ignore[no-untyped-def]
-    for r in range(len(owner)):
-        bit = np.uint64(1) << np.uint64(texel[r] & 63)
-        if blocked[r]:
-            words[owner[r], texel[r] >> 6] &= ~bit
-        else:
-            words[owner[r], texel[r] >> 6] |= bit
+def _write_bits(target, blocked, words):  # type: ignore[no-untyped-def]
+    for r in range(len(blocked)):
+        t = target[r]
+        at = np.uint64(t & 63)
+        here = ~(np.uint64(1) << at) & words[t >> 6]
+        words[t >> 6] = here | (np.uint64(not blocked[r]) << at)
 
 
 @njit(cache=True)
