@@ -19,6 +19,8 @@ from relightcli.cli.exits import INTERRUPTED, exit_code
 # Name, module, one line for --help. The modules are imported only when their command runs.
 COMMANDS = {
     "precompute": "Simulate the light transport of a scene once: SCENE.toml to a transfer store.",
+    "cluster": "Group receivers and find a basis for their light: a transfer store to a clusters store.",
+    "factorize": "Compress the transfer tensors of a clusters store into a self-contained asset.",
     "relight": "Make pictures from a store: new sky, camera, materials, sequences.",
     "diff": "Compare images, sequences or stores; exit 1 when they differ too much.",
     "inspect": "Show what a store holds, what it cost, and whether it is sound.",

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from relightcli.core.shade.gather import Gather
 
 IN_MEMORY = 1 << 30  # visibility up to this size stays in memory between frames
+KINDS = ("transfer", "clusters", "asset")
 BLACK = (0.0, 0.0, 0.0)
 
 
@@ -91,7 +92,9 @@ class LightingStore:
     """An open transfer store. Reads what it needs when it needs it; keeps small visibility in memory."""
 
     def __init__(self, path: Path, threads: int) -> None:
-        self.store = formats.open_store(path, "transfer")
+        self.store = formats.open_store(path)
+        if self.store.kind not in KINDS:
+            raise StoreError(f"{path}: expected a store of kind {' or '.join(KINDS)}, found {self.store.kind}.")
         self.threads = threads
         self.scene, self.geometry = read_scene(self.store)
         read: Any = self.store.read
@@ -163,7 +166,7 @@ class LightingStore:
         coats = self._coats(list(materials.values()))
         if coats.shiny.any() and view is None:
             raise InputError("a material with a specular lobe looks different from everywhere: a --camera is needed")
-        gather = self._gather() if bounces else None
+        gather = self.gather() if bounces else None
         lit = active if gather is None else None
         direct = self._direct(environment, rotate, coats, view, active, lit, basis or self.basis)
         if gather is None:
@@ -179,7 +182,7 @@ class LightingStore:
             pack_materials(materials),
             np.array([m.diffuse for m in materials], np.float32)[material],
             through,
-            self._partner() if through.any() else None,
+            self.partner() if through.any() else None,
             np.array([m.model in SHINY and m.specular != BLACK for m in materials], bool)[material],
         )
 
@@ -273,7 +276,7 @@ class LightingStore:
                     row,
                     self.threads,
                 )
-        tint = self._tint()
+        tint = self.tint()
         diffuse = direct.diffuse
         mask = np.ones(len(self), bool) if active is None else active
         if coats.partner is not None:
@@ -295,7 +298,7 @@ class LightingStore:
             diffuse = coats.diffuse(e)
             yield Radiance(diffuse, specular if coats.shiny.any() else None)
 
-    def _gather(self) -> Gather | None:
+    def gather(self) -> Gather | None:
         """Who sees whom; None where nothing blocks anything. Raises StoreError if that was not simulated."""
         if "bounce/hit" not in self.store:
             if self.store.attrs["nothing_blocks"]:
@@ -317,7 +320,7 @@ class LightingStore:
             self._gathered = join(parts)
         return self._gathered
 
-    def _tint(self) -> NDArray[np.float32] | None:
+    def tint(self) -> NDArray[np.float32] | None:
         """Colour of the texture at every receiver, (N, 3) float32; None without textures."""
         if "bounce/texture" not in self.store:
             return None
@@ -361,10 +364,11 @@ class LightingStore:
         out: NDArray[np.float32] = np.maximum(values, 0.0) * np.float32(np.pi)
         return out
 
-    def _partner(self) -> NDArray[np.int64]:
+    def partner(self) -> NDArray[np.int64]:
         """The receiver on the other side of the same vertex, itself where there is none."""
+        if self.vertex is None:
+            return np.arange(len(self))
         front, back = self.receiver_of_vertex()
-        assert self.vertex is not None
         other = np.where(self.side > 0, back[self.vertex], front[self.vertex]).astype(np.int64)
         return np.where(other >= 0, other, np.arange(len(self)))
 

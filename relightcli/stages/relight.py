@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import Any
+
+import relight_formats as formats
 
 from relightcli.stages.lighting import LightingStore
 from relightcli.stages.outputs import Config, check, check_shots, numbered, output_suffix, resolve_environment
@@ -24,7 +27,7 @@ def relight(config: Config) -> dict[str, Any]:
         from relightcli.stages.reference import render_reference
 
         return render_reference(config, shots, suffix, started)
-    lighting = LightingStore(config.store, config.workers)
+    lighting = open_lighting(config.store, config.workers)
     check_shots(config, shots, lighting.scene)
     if config.dry_run:
         return _plan(config, shots, lighting)
@@ -46,6 +49,15 @@ def relight(config: Config) -> dict[str, Any]:
         "frame_seconds": clocks,
         "notes": session.notes,
     }
+
+
+def open_lighting(path: Path, threads: int) -> LightingStore:
+    """The store of any stage that pictures are made from."""
+    if formats.open_store(path).kind != "asset":
+        return LightingStore(path, threads)
+    from relightcli.stages.asset import AssetStore
+
+    return AssetStore(path, threads)
 
 
 def _plan(config: Config, shots: list[Shot], lighting: LightingStore) -> dict[str, Any]:

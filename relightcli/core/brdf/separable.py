@@ -50,14 +50,8 @@ def polar_cosines() -> NDArray[np.float64]:
 
 def separate(model: int, row: NDArray[np.float64]) -> Separable:
     """The specular lobe of a parameter row (`brdf.models`), without its colour."""
-    cosine = polar_cosines()
-    values = np.empty((POLAR, POLAR, AZIMUTHS))
-    _tabulate(model, row, cosine, values)
-    harmonics = np.fft.rfft(values, axis=2).real[:, :, : ROWS[0]] / AZIMUTHS
-    harmonics[:, :, 1:] *= 2.0
-    lit = np.sqrt(np.sqrt(1.0 - cosine))  # solid angle goes with p dp
-    seen = lit * np.sqrt(cosine)
-    u, size, vt = np.linalg.svd(np.moveaxis(harmonics, 2, 0) * (seen[:, None] * lit))
+    spectra, lit, seen = harmonics(model, row[None])
+    u, size, vt = np.linalg.svd(spectra[0] * (seen[:, None] * lit))
     root = np.sqrt(size)
     view = [root[:count, j, None] * u[:count, :, j] / seen for j, count in enumerate(ROWS)]
     light = [root[:count, j, None] * vt[:count, j] / lit for j, count in enumerate(ROWS)]
@@ -65,6 +59,22 @@ def separate(model: int, row: NDArray[np.float64]) -> Separable:
         np.ascontiguousarray(np.concatenate(view).T, np.float32),
         np.ascontiguousarray(np.concatenate(light).T, np.float32),
     )
+
+
+def harmonics(
+    model: int, rows: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """S_m (H, ROWS[0], POLAR view, POLAR light) of H parameter rows, and the roots of the measures of light and view
+    (POLAR,) that make sums of squares integrals, up to a factor for all."""
+    cosine = polar_cosines()
+    values = np.empty((POLAR, POLAR, AZIMUTHS))
+    spectra = np.empty((len(rows), ROWS[0], POLAR, POLAR))
+    for h, row in enumerate(rows):
+        _tabulate(model, row, cosine, values)
+        spectra[h] = np.moveaxis(np.fft.rfft(values, axis=2).real[:, :, : ROWS[0]], 2, 0) / AZIMUTHS
+    spectra[:, 1:] *= 2.0
+    lit = np.sqrt(np.sqrt(1.0 - cosine))  # solid angle goes with p dp
+    return spectra, lit, lit * np.sqrt(cosine)
 
 
 @njit(cache=True, error_model="numpy")

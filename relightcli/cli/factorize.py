@@ -1,0 +1,62 @@
+"""relightcli factorize."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from relightcli.cli import options
+
+
+@click.command(name="factorize")
+@click.argument("store", type=options.PATH)
+@options.output("Asset to make, e.g. asset.zarr.")
+@click.option(
+    "--eigenvectors",
+    default=32,
+    show_default=True,
+    type=click.IntRange(1, 4096),
+    help="Rank along the receivers of a cluster.",
+)
+@click.option(
+    "--light-rank", default=64, show_default=True, type=click.IntRange(1, 4096), help="Rank along light, per cluster."
+)
+@click.option(
+    "--second-order",
+    default=0,
+    show_default=True,
+    type=click.IntRange(0, 4),
+    help="Bands of spherical harmonics for the second bounce; 0 is a uniform value.",
+)
+@click.option("--dry-run", is_flag=True, help="Say what would be made; do nothing.")
+@options.workers
+@options.overwrite
+@options.report
+def command(
+    store: Path, output: Path, workers: int | None, verbose: bool, quiet: bool, as_json: bool, **settings: Any
+) -> None:
+    """Compress the transfer tensors of the clusters store STORE into an asset that pictures are made from."""
+    from relightcli.stages.factorize import Config, factorize
+
+    config = Config(
+        store=store, output=output, workers=workers or options.available_cores(), quiet=quiet or as_json, **settings
+    )
+    result = factorize(config)
+    options.tell(result, _text(result), as_json, quiet)
+
+
+def _text(result: dict[str, Any]) -> str:
+    lines = [f"note: {note}" for note in result["notes"]]
+    if result.get("dry_run"):
+        lines.append(f"{result['receivers']} receivers in {result['clusters']} clusters")
+    elif result["status"] == "up to date":
+        lines.append(f"{result['store']} is up to date")
+    else:
+        lost = ", ".join(f"{name} leaves {error['total']:.1%}" for name, error in result["errors"].items())
+        lines.append(
+            f"{result['store']}: {result['receivers']} receivers, {lost}, {options.bytes_text(result['bytes'])}, "
+            f"{result['seconds']:.1f} s"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,186 @@
+"""Stage cluster: a transfer store in; out comes the same with receivers in groups and a basis for their light.
+
+Receivers whose interreflections are alike are grouped by CPCA over their one-bounce tensors [Sun 2007, sec. 3.4; Sloan
+2003]; the light axis of those tensors gets an orthonormal basis whose rank follows from a tolerance.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import relight_formats as formats
+from relightcli import __version__
+from relightcli.adapters.files import need_output
+from relightcli.core.brdf.transport_basis import FUNCTIONS
+from relightcli.core.compress.cpca import cpca
+from relightcli.core.compress.tucker import gram_spectrum
+from relightcli.errors import InputError, StoreError
+from relightcli.stages.lighting import LightingStore
+from relightcli.stages.transfer_setup import BLOCK, CELLS, TransferSetup, coarse_cells
+
+KIND = "clusters"
+ORDER = 4  # bands of the tensors
+TERMS = 16  # eigenvectors of a cluster when receivers are grouped
+SKETCH = 128  # random directions that stand in for a receiver's tensor
+SAMPLE = 1024  # receivers whose full tensors show what light they react to
+RECEIVERS_PER_CLUSTER = 1000
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that `cluster` needs to know. `clusters` None: one per 1000 receivers."""
+
+    store: Path
+    output: Path
+    clusters: int | None = None
+    tolerance: float = 0.01
+    functions: int = FUNCTIONS
+    seed: int = 0
+    workers: int = 1
+    overwrite: bool = False
+    dry_run: bool = False
+    quiet: bool = False
+
+
+def cluster(config: Config) -> dict[str, Any]:
+    """Runs the stage; returns a summary. Raises InputError, StoreError, NumericalError, OSError."""
+    started = time.perf_counter()
+    if not 0.0 < config.tolerance < 1.0:
+        raise InputError(f"--tolerance: expected more than 0 and less than 1; found {config.tolerance}")
+    need_output(config.output)
+    lighting = LightingStore(config.store, config.workers)
+    if lighting.store.kind != "transfer":
+        raise StoreError(f"{config.store}: expected a store of kind transfer, found {lighting.store.kind}.")
+    _need_bounces(lighting)
+    clusters = config.clusters or max(1, round(len(lighting) / RECEIVERS_PER_CLUSTER))
+    settings = {
+        **lighting.store.settings,
+        "clusters": clusters,
+        "cluster_tolerance": config.tolerance,
+        "functions": config.functions,
+        "cluster_seed": config.seed,
+        "order": ORDER,
+    }
+    if config.dry_run:
+        return {"dry_run": True, "receivers": len(lighting), "clusters": clusters, "notes": []}
+    writer = formats.begin(
+        config.output,
+        KIND,
+        settings=settings,
+        inputs={"transfer": lighting.store.fingerprint},
+        program=f"relightcli {__version__}",
+        overwrite=config.overwrite,
+    )
+    if writer is None:
+        return {"store": str(config.output), "status": "up to date", "notes": []}
+    with writer:
+        resumed = bool(writer.done)
+        writer.set_attrs(lighting.store.attrs)
+        copy_arrays(lighting.store, writer, lighting.store.names())
+        setup = TransferSetup(lighting, config.functions, config.workers)
+        if "light-basis" not in writer.done:
+            clock = time.perf_counter()
+            basis, held_out = _light_basis(setup, config)
+            writer.put("light/basis", basis, dims=("light_cell", "light"))
+            writer.record("light-basis", {"seconds": time.perf_counter() - clock, "error": held_out})
+        if "groups" not in writer.done:
+            clock = time.perf_counter()
+            found = cpca(_sketch(setup, config), clusters, TERMS, config.seed)
+            writer.put("cluster/label", found.label, dims=("receiver",))
+            left = float(np.sqrt(found.residuals[-1] / found.norm2)) if found.norm2 else 0.0
+            writer.record("groups", {"seconds": time.perf_counter() - clock, "clusters": found.count, "error": left})
+        seconds = time.perf_counter() - started
+        writer.commit({"seconds": seconds, "resumed": resumed, "workers": config.workers})
+    store = formats.open_store(config.output, KIND)
+    info = {block["id"]: block for block in store.blocks}
+    return {
+        "store": str(config.output),
+        "status": "resumed" if resumed else "written",
+        "receivers": len(lighting),
+        "clusters": info["groups"]["clusters"],
+        "light_rank": int(store.layouts["light/basis"].shape[1]),
+        "light_error": info["light-basis"]["error"],
+        "bytes": sum(size.stored for size in store.sizes().values()),
+        "seconds": time.perf_counter() - started,
+        "notes": [],
+    }
+
+
+def _need_bounces(lighting: LightingStore) -> None:
+    if "bounce/hit" not in lighting.store:
+        raise StoreError(
+            f"{lighting.store.path}: holds direct light only, which needs no clusters; precompute with --bounces 1 or 2"
+        )
+
+
+def copy_arrays(store: formats.Store, writer: formats.Writer, names: list[str]) -> None:
+    """Copies arrays as they are, a range of chunks at a time."""
+    for name in names:
+        if f"copy {name}" in writer.done:
+            continue
+        source: Any = store.array(name)
+        layout = store.layouts[name]
+        attributes = dict(source.attrs)
+        units = attributes.pop("units")
+        target: Any = writer.array(
+            name,
+            shape=layout.shape,
+            dtype=layout.data_type,
+            chunks=layout.chunks,
+            dims=layout.dims,
+            units=None if units == "1" else units,
+            attrs=attributes,
+            codec="zstd" if any(c["name"] == "zstd" for c in source.metadata.to_dict()["codecs"]) else "lz4",
+        )
+        step = max(1, layout.chunks[0])
+        for start in range(0, layout.shape[0], step):
+            target[start : start + step] = source[start : start + step]
+        writer.record(f"copy {name}", {})
+
+
+def _light_basis(setup: TransferSetup, config: Config) -> tuple[NDArray[np.float32], float]:
+    """Basis (6 CELLS^2, L) of what light one-bounce tensors react to, and the relative RMS that it leaves of those of
+    receivers that it was not made from."""
+    n = len(setup.lighting)
+    picked = np.random.default_rng(config.seed).permutation(n)[:SAMPLE]
+    cells = 6 * CELLS * CELLS
+    tensors = np.empty((len(picked), setup.count * ORDER * ORDER, cells), np.float32)
+    for face in range(6):
+        own = slice(face * CELLS * CELLS, (face + 1) * CELLS * CELLS)
+        sources = setup.sources(np.eye(cells, dtype=np.float32)[:, own])
+        part = setup.gather_rows(picked, sources, ORDER)[..., : CELLS * CELLS]
+        tensors[:, :, own] = part.reshape(len(picked), -1, CELLS * CELLS)
+        del sources
+    half = max(1, len(picked) // 2)
+    rows = tensors[:half].reshape(-1, cells)
+    gram = np.zeros((cells, cells))
+    for a in range(0, len(rows), 1 << 14):
+        part = rows[a : a + (1 << 14)].astype(np.float64)
+        gram += part.T @ part
+    values, vectors = gram_spectrum(gram)
+    left = np.sqrt(np.maximum(0.0, 1.0 - np.cumsum(values) / max(values.sum(), 1e-300)))
+    rank = int(np.argmax(left <= config.tolerance)) + 1 if (left <= config.tolerance).any() else len(values)
+    basis = np.ascontiguousarray(vectors[:, :rank], np.float32)
+    rest = tensors[half:] if len(picked) > half else tensors
+    norm2 = float((rest.astype(np.float64) ** 2).sum())
+    kept = float(((rest.reshape(-1, cells) @ basis).astype(np.float64) ** 2).sum())
+    return basis, float(np.sqrt(max(0.0, 1.0 - kept / norm2))) if norm2 else 0.0
+
+
+def _sketch(setup: TransferSetup, config: Config) -> NDArray[np.float32]:
+    """Random projections of the receivers' tensors under coarse light, (N, SKETCH): their distances are nearly kept."""
+    sources = setup.sources(coarse_cells())
+    n, size = len(setup.lighting), setup.count * ORDER * ORDER * sources.even.shape[1]
+    rng = np.random.default_rng(config.seed)
+    directions = rng.standard_normal((size, min(SKETCH, size))).astype(np.float32) / np.float32(np.sqrt(SKETCH))
+    out = np.empty((n, directions.shape[1]), np.float32)
+    for start in range(0, n, BLOCK):
+        rows = np.arange(start, min(start + BLOCK, n))
+        out[rows] = setup.gather_rows(rows, sources, ORDER).reshape(len(rows), -1) @ directions
+    return out

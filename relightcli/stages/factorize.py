@@ -1,0 +1,276 @@
+"""Stage factorize: a clusters store in, a self-contained asset out. [Sun 2007, sec. 3.4]
+
+Per cluster the one-bounce tensor (receivers x light x the rest) is compressed along receivers and light by clustered
+tensor approximation, a Tucker-2 decomposition; the two-bounce tensor by a principal component analysis along receivers.
+Everything is quantised; every cluster records what compression and quantisation leave out.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import relight_formats as formats
+from relightcli import __version__
+from relightcli.adapters.files import need_output
+from relightcli.core.compress.tucker import hooi
+from relightcli.errors import InputError, StoreError
+from relightcli.stages.cluster import copy_arrays
+from relightcli.stages.lighting import LightingStore
+from relightcli.stages.transfer_setup import COARSE, TransferSetup, coarse_cells
+
+KIND = "asset"
+SWEEPS = 1
+LEFT_OUT = ("bounce/hit", "light/basis", "cluster/label")  # of the clusters store's arrays
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that `factorize` needs to know. second_order: bands of the second bounce, 0 for its mean."""
+
+    store: Path
+    output: Path
+    eigenvectors: int = 32
+    light_rank: int = 64
+    second_order: int = 0
+    workers: int = 1
+    overwrite: bool = False
+    dry_run: bool = False
+    quiet: bool = False
+
+
+def factorize(config: Config) -> dict[str, Any]:
+    """Runs the stage; returns a summary. Raises InputError, StoreError, NumericalError, OSError."""
+    started = time.perf_counter()
+    for name, value in (("--eigenvectors", config.eigenvectors), ("--light-rank", config.light_rank)):
+        if value < 1:
+            raise InputError(f"{name}: expected at least 1; found {value}")
+    need_output(config.output)
+    lighting = LightingStore(config.store, config.workers)
+    store = lighting.store
+    if store.kind != "clusters":
+        raise StoreError(f"{config.store}: expected a store of kind clusters, found {store.kind}; run cluster first.")
+    bounces = min(2, lighting.bounces)
+    settings = {
+        **store.settings,
+        "bounces": bounces,
+        "eigenvectors": config.eigenvectors,
+        "light_rank": config.light_rank,
+        "second_order": config.second_order,
+    }
+    read: Any = store.read
+    label: NDArray[np.int32] = read("cluster/label")
+    clusters = int(label.max()) + 1
+    if config.dry_run:
+        return {"dry_run": True, "receivers": len(lighting), "clusters": clusters, "notes": []}
+    writer = formats.begin(
+        config.output,
+        KIND,
+        settings=settings,
+        inputs={"clusters": store.fingerprint},
+        program=f"relightcli {__version__}",
+        overwrite=config.overwrite,
+    )
+    notes = []
+    if lighting.bounces > bounces:
+        notes.append(f"the asset has 2 interreflections of the store's {lighting.bounces}")
+    if writer is None:
+        return {"store": str(config.output), "status": "up to date", "notes": notes}
+    with writer:
+        resumed = bool(writer.done)
+        writer.set_attrs(store.attrs)
+        copy_arrays(store, writer, [name for name in store.names() if name not in LEFT_OUT])
+        setup = TransferSetup(lighting, int(store.settings["functions"]), config.workers)
+        order = np.argsort(label, kind="stable")
+        start = np.concatenate([[0], np.cumsum(np.bincount(label, minlength=clusters))]).astype(np.int64)
+        writer.put("cluster/receiver", order.astype(np.int32), dims=("receiver",))
+        writer.put("cluster/start", start, dims=("boundary",))
+        basis: NDArray[np.float32] = read("light/basis")
+        writer.put("one_bounce/basis", basis, dims=("light_cell", "light"))
+        bands = int(store.settings["order"])
+        if bounces:
+            _one_bounce(config, writer, setup, basis, order, start, bands)
+        if bounces > 1:
+            _two_bounces(config, writer, setup, order, start, bands)
+        writer.commit({"seconds": time.perf_counter() - started, "resumed": resumed, "workers": config.workers})
+    return _summary(config, started, resumed, notes)
+
+
+def _one_bounce(
+    config: Config,
+    writer: formats.Writer,
+    setup: TransferSetup,
+    basis: NDArray[np.float32],
+    order: NDArray[np.int64],
+    start: NDArray[np.int64],
+    bands: int,
+) -> None:
+    clusters, most = len(start) - 1, int(np.diff(start).max())
+    lights = basis.shape[1] + setup.lamps
+    rank_v, rank_l = min(config.eigenvectors, most), min(config.light_rank, lights)
+    rest = setup.count * bands * bands
+    outputs = _Outputs(
+        writer,
+        "one_bounce",
+        {
+            "receiver_factor": ((most, rank_v), ("place", "eigenvector"), (1,)),
+            "light_factor": ((lights, rank_l), ("lamp_or_light", "light_eigenvector"), (0,)),
+            "core": ((rank_l, rank_v, rest), ("light_eigenvector", "eigenvector", "channel_and_harmonic"), (2,)),
+        },
+        clusters,
+        {"core": "int8"},
+    )
+    todo = [c for c in range(clusters) if f"one-bounce {c}" not in writer.done]
+    if not todo:
+        return
+    sources = setup.sources(basis)
+    for c in todo:
+        clock = time.perf_counter()
+        rows = order[start[c] : start[c + 1]]
+        tensor = setup.gather_rows(rows, sources, bands).reshape(len(rows), rest, lights)
+        found = hooi(tensor, (rank_v, None, rank_l), sweeps=SWEEPS)
+        u_v, _, u_l = found.factors
+        assert u_v is not None
+        assert u_l is not None
+        core = np.transpose(found.core, (2, 0, 1))
+        kept = outputs.put(c, {"receiver_factor": u_v, "light_factor": u_l, "core": core})
+        back = np.einsum("lvq,nv->nlq", kept["core"], kept["receiver_factor"][: len(rows)], optimize=True)
+        back = np.einsum("ml,nlq->nqm", kept["light_factor"], back, optimize=True)
+        error2 = float(((tensor - back).astype(np.float64) ** 2).sum())
+        writer.record(
+            f"one-bounce {c}",
+            {
+                "seconds": time.perf_counter() - clock,
+                "receivers": len(rows),
+                "norm2": found.norm2,
+                "compression2": found.error2,
+                "error2": error2,
+            },
+        )
+
+
+def _two_bounces(
+    config: Config,
+    writer: formats.Writer,
+    setup: TransferSetup,
+    order: NDArray[np.int64],
+    start: NDArray[np.int64],
+    bands: int,
+) -> None:
+    clusters, most = len(start) - 1, int(np.diff(start).max())
+    rank = min(config.eigenvectors, most)
+    coarse = 6 * COARSE * COARSE + setup.lamps
+    harmonics = max(1, config.second_order**2)
+    size = setup.count * harmonics * coarse * setup.count
+    outputs = _Outputs(
+        writer,
+        "two_bounce",
+        {
+            "receiver_factor": ((most, rank), ("place", "eigenvector"), (1,)),
+            "core": ((rank, size), ("eigenvector", "channels_harmonic_light"), (1,)),
+        },
+        clusters,
+        {},
+    )
+    todo = [c for c in range(clusters) if f"two-bounce {c}" not in writer.done]
+    if not todo:
+        return
+    sources = setup.second_sources(setup.sources(coarse_cells()), bands)
+    for c in todo:
+        clock = time.perf_counter()
+        rows = order[start[c] : start[c + 1]]
+        tensor = setup.gather_rows(rows, sources, config.second_order).reshape(len(rows), size, 1)
+        found = hooi(tensor, (rank, None, None), sweeps=0)
+        u_v = found.factors[0]
+        assert u_v is not None
+        kept = outputs.put(c, {"receiver_factor": u_v, "core": found.core[:, :, 0]})
+        back = kept["receiver_factor"][: len(rows)] @ kept["core"]
+        error2 = float(((tensor[:, :, 0] - back).astype(np.float64) ** 2).sum())
+        writer.record(
+            f"two-bounce {c}",
+            {
+                "seconds": time.perf_counter() - clock,
+                "receivers": len(rows),
+                "norm2": found.norm2,
+                "compression2": found.error2,
+                "error2": error2,
+            },
+        )
+
+
+class _Outputs:
+    """Quantised factors, one chunk per cluster; ranks that a cluster does not have are zero."""
+
+    def __init__(
+        self,
+        writer: formats.Writer,
+        group: str,
+        arrays: dict[str, tuple[tuple[int, ...], tuple[str, ...], tuple[int, ...]]],
+        clusters: int,
+        codes: dict[str, str],
+    ) -> None:
+        self.shapes, self.axes, self.codes = {}, {}, {}
+        self.values: dict[str, Any] = {}
+        self.scales: dict[str, Any] = {}
+        for name, (shape, dims, axes) in arrays.items():
+            self.codes[name] = codes.get(name, "int16")
+            self.shapes[name], self.axes[name] = shape, axes
+            self.values[name] = writer.array(
+                f"{group}/{name}",
+                shape=(clusters, *shape),
+                dtype=self.codes[name],
+                chunks=(1, *shape),
+                dims=("cluster", *dims),
+                attrs={"scale": f"{group}/{name}_scale"},
+                codec="zstd",
+            )
+            scale_shape = tuple(1 if k in axes else n for k, n in enumerate(shape))
+            self.scales[name] = writer.array(
+                f"{group}/{name}_scale",
+                shape=(clusters, *scale_shape),
+                dtype="float32",
+                chunks=(1, *scale_shape),
+                dims=("cluster", *(f"one_{d}" if k in axes else d for k, d in enumerate(dims))),
+                codec="zstd",
+            )
+
+    def put(self, cluster: int, found: dict[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float32]]:
+        """Writes a cluster's factors; returns them as they will be read."""
+        out = {}
+        for name, values in found.items():
+            padded = np.zeros(self.shapes[name])
+            padded[tuple(slice(0, n) for n in values.shape)] = values
+            codes, scale = formats.quantise(padded, self.codes[name], axis=self.axes[name])  # type: ignore[arg-type]
+            self.values[name][cluster] = codes
+            self.scales[name][cluster] = scale
+            out[name] = formats.dequantise(codes, scale)
+        return out
+
+
+def _summary(config: Config, started: float, resumed: bool, notes: list[str]) -> dict[str, Any]:
+    store = formats.open_store(config.output, KIND)
+    errors = {}
+    for effect in ("one-bounce", "two-bounce"):
+        blocks = [b for b in store.blocks if b["id"].startswith(effect)]
+        norm2 = sum(b["norm2"] for b in blocks)
+        if norm2 > 0.0:
+            worst = max((b["error2"] / b["norm2"] for b in blocks if b["norm2"] > 0.0), default=0.0)
+            errors[effect.replace("-", "_")] = {
+                "compression": (sum(b["compression2"] for b in blocks) / norm2) ** 0.5,
+                "total": (sum(b["error2"] for b in blocks) / norm2) ** 0.5,
+                "worst_cluster": worst**0.5,
+            }
+    return {
+        "store": str(config.output),
+        "status": "resumed" if resumed else "written",
+        "receivers": int(store.layouts["cluster/receiver"].shape[0]),
+        "errors": errors,
+        "bytes": sum(size.stored for size in store.sizes().values()),
+        "seconds": time.perf_counter() - started,
+        "notes": notes,
+    }

@@ -1,0 +1,186 @@
+"""What cluster and factorize share: a transfer store made ready for the transfer tensors of its interreflections."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relightcli.core.brdf.models import pack_materials
+from relightcli.core.shade.gather import Gather
+from relightcli.core.shade.local import local_radiance
+from relightcli.core.shade.lobe_factors import LobeFactors, local_lobes
+from relightcli.core.sphere import cube
+from relightcli.core.transport.channels import light_factors, plan_channels, shiny_models
+from relightcli.core.transport.local_lights import pack_lights
+from relightcli.core.transport.transfer import (
+    SPECULAR,
+    Sources,
+    even_projection,
+    gather_transfer,
+    light_factor_projections,
+    local_rotations,
+    sky_sources,
+    used_terms,
+)
+from relightcli.errors import StoreError
+from relightcli.stages.lighting import LightingStore
+
+CELLS = 8  # of a face of the sky, for one bounce
+COARSE = 2  # the same for two bounces
+LAMP_COLUMNS = 3  # the local lights' light, by colour, comes after the sky's cells
+BLOCK = 512  # receivers whose tensors are gathered at a time
+
+
+def coarse_cells() -> NDArray[np.float32]:
+    """Response to a coarse cell from those to its fine cells, (6 CELLS^2, 6 COARSE^2): which one each lies in."""
+    ratio = CELLS // COARSE
+    face, row, column = np.meshgrid(np.arange(6), np.arange(CELLS), np.arange(CELLS), indexing="ij")
+    cell = ((face * COARSE + row // ratio) * COARSE + column // ratio).reshape(-1)
+    return np.eye(6 * COARSE * COARSE, dtype=np.float32)[cell]
+
+
+def cell_radiance(flux: NDArray[np.float64], resolution: int, cells: int) -> NDArray[np.float64]:
+    """Mean radiance (6 C C, 3) of a sky's coarse cells from the flux (6 R R, 3) of its texels."""
+    side = resolution // cells
+    total = flux.reshape(6, cells, side, cells, side, 3).sum(axis=(2, 4)).reshape(-1, 3)
+    solid = np.tile(cube.solid_angles(resolution).reshape(cells, side, cells, side).sum(axis=(1, 3)), (6, 1, 1))
+    radiance: NDArray[np.float64] = total / solid.reshape(-1, 1)
+    return radiance
+
+
+class TransferSetup:
+    """Channels, gathers and sources of one store. `functions`: specular basis functions of an adjustable material."""
+
+    def __init__(self, lighting: LightingStore, functions: int, threads: int) -> None:
+        self.lighting, self.threads = lighting, threads
+        scene, geometry = lighting.scene, lighting.geometry
+        materials = list(scene.materials.values())
+        self.table = pack_materials(materials)
+        self.adjustable = [m.adjustable for m in materials]
+        self.textured = [m in geometry.textures for m in range(len(materials))]
+        self.channels, self.exits, place = plan_channels(self.table, self.adjustable, self.textured, functions)
+        self.factors = light_factors(shiny_models(self.table, self.adjustable), functions)
+        self.material: NDArray[np.int32] = geometry.material[lighting.object].astype(np.int32)
+        self.model = np.where(self.exits.functions[self.material] > 0, place[self.material], -1).astype(np.int32)
+        self.row = np.where(self.model >= 0, np.cumsum(self.model >= 0) - 1, -1).astype(np.int32)
+        self.partner = lighting.partner()
+        self.texture = lighting.tint()
+        self.lamps = LAMP_COLUMNS if scene.lights else 0
+        gather = lighting.gather()
+        if gather is None:
+            raise StoreError(f"{lighting.store.path}: nothing blocks anything in this scene; it has no interreflections")
+        self.gather = gather
+
+    @property
+    def count(self) -> int:
+        """Channels."""
+        return len(self.channels.material)
+
+    def sources(self, basis: NDArray[np.float32]) -> Sources:
+        """Responses to the lights of `basis` (6 CELLS^2, L), the lamps' columns after them."""
+        lighting, used = self.lighting, used_terms(len(self.factors[0]))
+        lights = basis.shape[1]
+        shiny = int((self.model >= 0).sum())
+        even = np.zeros((len(lighting), lights + self.lamps), np.float32)
+        factor = np.zeros((shiny, len(used), lights + self.lamps), np.float32)
+        for block, bits in lighting.blocks():
+            step = 4096
+            for start in range(block.start, block.stop, step):
+                rows = slice(start, min(start + step, block.stop))
+                part = bits[start - block.start : rows.stop - block.start]
+                own = self.row[rows]
+                own = own[own >= 0]
+                for face in range(6):
+                    cells = basis[face * CELLS**2 : (face + 1) * CELLS**2]
+                    if not cells.any():
+                        continue
+                    e, f = sky_sources(
+                        part,
+                        lighting.normal[rows],
+                        self.model[rows],
+                        self.factors,
+                        face,
+                        CELLS,
+                        used,
+                        self.threads,
+                    )
+                    even[rows, :lights] += e @ cells
+                    if len(own):
+                        factor[own[0] : own[-1] + 1, :, :lights] += f @ cells
+        if self.lamps:
+            self._add_lamps(even, factor, used)
+        return Sources(even, factor, self.row, used, self.partner)
+
+    def _add_lamps(self, even: NDArray[np.float32], factor: NDArray[np.float32], used: NDArray[np.int64]) -> None:
+        lighting = self.lighting
+        bits, lights = lighting.store.read("lights/bits"), pack_lights(lighting.scene.lights.values())
+        irradiance, _ = local_radiance(
+            bits,
+            lights,
+            lighting.position,
+            lighting.normal,
+            None,
+            self.material,
+            self.table,
+            np.ones(len(lighting), bool),
+            self.threads,
+        )
+        even[:, -LAMP_COLUMNS:] = irradiance / np.float32(np.pi)
+        if not len(factor):
+            return
+        place = np.array([self.model[self.material == m].max(initial=-1) for m in range(len(self.table.model))])
+        own = LobeFactors(place >= 0, self.exits.view_factor[:, 0], self.factors[place], np.ones((len(place), 3)))
+        lobe = np.zeros((len(factor), 6, self.factors.shape[2]), np.float32)
+        local_lobes(
+            bits, lights, lighting.position, lighting.normal, self.material, own, lobe, self.row, self.threads
+        )
+        for f, (side, term) in enumerate(used):
+            factor[:, f, -LAMP_COLUMNS:] = lobe[:, 3 * side : 3 * side + 3, term]
+
+    def gather_rows(self, rows: NDArray[np.int64], sources: Sources, order: int) -> NDArray[np.float32]:
+        """Transfer (len(rows), Q, S, L) of some receivers, `transfer.gather_transfer`."""
+        return gather_transfer(
+            self._rows(rows),
+            0,
+            sources,
+            self.exits,
+            self.count,
+            order,
+            self.lighting.normal,
+            self.material,
+            self.texture,
+            self.threads,
+        )
+
+    def _rows(self, rows: NDArray[np.int64]) -> Gather:
+        whole = self.gather
+        counts = whole.start[rows + 1] - whole.start[rows]
+        start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        index = np.repeat(whole.start[rows] - start[:-1], counts) + np.arange(start[-1])
+        return Gather(
+            whole.cells, start, whole.source[index], whole.cell[index], whole.cosine[index], whole.solid_angle[index]
+        )
+
+    def second_sources(self, lights: Sources, order: int) -> Sources:
+        """What receivers gather of light that was reflected once: for each light of `lights` and channel, (l, q)."""
+        lighting = self.lighting
+        even_weights = even_projection(order).astype(np.float32)
+        used = used_terms(order - 1)
+        projections = np.stack([light_factor_projections(f, order) for f in self.factors])
+        weights = projections[:, used[:, 1], used[:, 0]].astype(np.float32)  # (models, F, S)
+        n, q, count = len(lighting), self.count, lights.even.shape[1]
+        even = np.empty((n, count * q), np.float32)
+        factor = np.zeros((int((self.model >= 0).sum()), len(used), count * q), np.float32)
+        for start in range(0, n, BLOCK):
+            rows = np.arange(start, min(start + BLOCK, n))
+            world = self.gather_rows(rows, lights, order)
+            flat = np.moveaxis(world, 1, 3).reshape(len(rows), order * order, count * q)
+            local = local_rotations(lighting.normal[rows], order) @ flat
+            even[rows] = even_weights @ local
+            shiny = np.flatnonzero(self.model[rows] >= 0)
+            if len(shiny):
+                factor[self.row[rows[shiny]]] = weights[self.model[rows[shiny]]] @ local[shiny]
+        return Sources(even, factor, self.row, used, self.partner)
+
+    def has_lobes(self) -> bool:
+        return bool((self.channels.part >= SPECULAR).any() or self.exits.functions.any())
