@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 import relight_formats as formats
 from relightcli.core.brdf.models import SPECULAR as SPECULAR_COLUMN
+from relightcli.core.brdf.separable import POLAR
 from relightcli.core.lights.environment import latlong_to_cube
 from relightcli.core.shade.gather import in_parts
 from relightcli.core.shade.low_order import response, shade_low_order
@@ -61,7 +62,7 @@ class AssetStore(LightingStore):
         material that has become another model than its tensors were made for."""
         bounces = self.bounces if bounces is None else bounces
         if bounces > self.bounces:
-            raise InputError(f"--bounces {bounces}: the asset holds {self.bounces}; use the transfer store it came from")
+            raise InputError(f"--bounces {bounces}: the asset has {self.bounces}; use the transfer store it came from")
         listed = list(materials.values())
         for material, model in zip(listed, self.made_for, strict=True):
             if material.model != model:
@@ -78,73 +79,86 @@ class AssetStore(LightingStore):
         tensors = self._tensors
         tensors.set_light(environment, rotate)
         tensors.set_materials(coefficients(self.channels, coats.table, self.functions))
-        for fields in tensors.fields[:bounces]:
-            diffuse = coats.diffuse(fields.even * np.float32(np.pi))
-            specular = None
-            if coats.shiny.any() and view is not None:
-                specular = self._specular(coats, fields, view)
-            parts.append(Radiance(diffuse, specular))
+        shines = bool(coats.shiny.any()) and view is not None
+        specular = self._specular(coats, view) if shines else [None] * len(tensors.even)
+        for even, lobes in zip(tensors.even[:bounces], specular[:bounces], strict=True):
+            parts.append(Radiance(coats.diffuse(even * np.float32(np.pi)), lobes))
         return parts
 
-    def _specular(self, coats: _Coats, fields: _Fields, view: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _specular(self, coats: _Coats, view: NDArray[np.float32] | None) -> list[NDArray[np.float32] | None]:
+        """Specular exit radiance after every bounce."""
         assert self._tensors is not None
-        rows = self._tensors.lobed
-        order = 1 if fields.local.shape[1] == 1 else self.order
-        bands = order * (order + 1) // 2
-        tables = np.zeros((len(coats.table.model), *response(SHINY[0], coats.table.parameters[0], 1).shape[:1], bands))
-        for m, code in enumerate(coats.table.model):
-            if code in SHINY:
-                tables[m] = response(int(code), coats.table.parameters[m], order)
-        colour = coats.table.parameters[:, SPECULAR_COLUMN : SPECULAR_COLUMN + 3]
-        out = np.zeros((len(self), 3), np.float32)
-        found = shade_low_order(
-            fields.local,
-            self._tensors.lobed_normal,
-            view[rows],
-            tables.astype(np.float32),
-            np.where(np.isin(coats.table.model, SHINY)[:, None], colour, 0.0).astype(np.float32),
-            self._tensors.lobed_material,
-            self.threads,
-        )
-        out[rows] = np.maximum(found, 0.0)
+        assert view is not None
+        tensors, table = self._tensors, coats.table
+        shiny = np.isin(table.model, SHINY)
+        tables = np.zeros((len(table.model), POLAR, self.order * (self.order + 1) // 2), np.float32)
+        for m in np.flatnonzero(shiny):
+            tables[m] = response(int(table.model[m]), table.parameters[m], self.order)
+        colours = table.parameters[:, SPECULAR_COLUMN : SPECULAR_COLUMN + 3]
+        colour = np.where(shiny[:, None], colours, 0.0).astype(np.float32)
+        seen = view[tensors.lobed]
+        uniform = tensors.uniform if tensors.uniform is not None else np.zeros((len(seen), 3), np.float32)
+        found: list[NDArray[np.float32]] = []
+        for k, local in enumerate(tensors.local):
+            both = shade_low_order(
+                local, uniform, tensors.lobed_normal, seen, tables, colour, tensors.lobed_material, self.threads
+            )
+            found.append(both[0])
+            if k == 0 and tensors.uniform is not None:
+                found.append(both[1])
+        out: list[NDArray[np.float32] | None] = []
+        for part in found:
+            whole = np.zeros((len(self), 3), np.float32)
+            whole[tensors.lobed] = np.maximum(part, 0.0)
+            out.append(whole)
         return out
 
 
-class _Fields:
-    """Light that arrives after some bounces: even (N, 3), irradiance over pi; local (n, S, 3), harmonics in the frames
-    of the receivers with a lobe; S = 1 for a uniform value."""
-
-    def __init__(self, even: NDArray[np.float32], local: NDArray[np.float32]) -> None:
-        self.even, self.local = even, local
-
-
 class _Tensors:
-    """The asset's tensors in memory, and what has been made of them."""
+    """The asset's tensors in memory, receivers in the order of their clusters, and what has been made of them.
+
+    even: per bounce (N, 3), irradiance over pi, in the receivers' own order; local: (n, 3, S), harmonics in the frames
+    of the receivers with a lobe, `lobed` (n,), for one bounce, and for two if it has harmonics; uniform (n, 3), the
+    second bounce's value if it has none.
+    """
 
     def __init__(self, asset: AssetStore) -> None:
         self.asset = asset
         read: Any = asset.store.read
-        self.receiver: NDArray[np.int32] = read("cluster/receiver")
-        self.start: NDArray[np.int64] = read("cluster/start")
+        receiver: NDArray[np.int32] = read("cluster/receiver")
+        start: NDArray[np.int64] = read("cluster/start")
+        self.receiver = receiver
+        self.cluster = np.repeat(np.arange(len(start) - 1), np.diff(start)).astype(np.int32)
+        place = np.arange(len(receiver)) - start[self.cluster]
         self.basis: NDArray[np.float32] = read("one_bounce/basis")
-        self.q, self.s = len(asset.channels.material), asset.order**2
-        self.first = {k: _factors(asset.store, f"one_bounce/{k}") for k in ("receiver_factor", "light_factor", "core")}
-        self.second: dict[str, Factors] = {}
+        self.q = len(asset.channels.material)
+        self.rows = [_factors(asset.store, "one_bounce/receiver_factor")[self.cluster, place]]
+        self.light_factor = _factors(asset.store, "one_bounce/light_factor")
+        core = _factors(asset.store, "one_bounce/core")
+        self.core = core.reshape(*core.shape[:2], -1)
+        self.second: Factors | None = None
         if asset.bounces > 1:
-            self.second = {k: _factors(asset.store, f"two_bounce/{k}") for k in ("receiver_factor", "core")}
-        materials = asset.geometry.material[asset.object]
-        may_shine = np.array([m in ("blinn-phong", "cook-torrance", "phong") for m in asset.made_for])
-        self.lobed = np.flatnonzero(may_shine[materials])
+            self.rows.append(_factors(asset.store, "two_bounce/receiver_factor")[self.cluster, place])
+            self.second = _factors(asset.store, "two_bounce/core")
+        material = asset.geometry.material[asset.object]
+        may_shine = np.isin(asset.made_for, list(LOBED))[material[receiver]]
+        self.lobed = receiver[may_shine]
+        self.lobe_row = np.where(may_shine, np.cumsum(may_shine) - 1, -1).astype(np.int32)
         self.lobed_normal = np.ascontiguousarray(asset.normal[self.lobed])
-        self.lobed_material = materials[self.lobed].astype(np.int32)
-        rotations = local_rotations(asset.normal, asset.order)
+        self.lobed_material = material[self.lobed].astype(np.int32)
+        rotations = local_rotations(asset.normal[receiver], asset.order)
         self.even_weights = np.ascontiguousarray(even_projection(asset.order) @ rotations, np.float32)
-        self.rotations = np.ascontiguousarray(rotations[self.lobed])
-        self.fields: list[_Fields] = []
+        kept = np.flatnonzero(np.equal.outer(*[_bands(asset.order)] * 2).reshape(-1))  # a rotation keeps the band
+        turned = np.swapaxes(rotations[may_shine], 1, 2).reshape(-1, asset.order**4)  # column after column
+        self.rotations = np.ascontiguousarray(turned[:, kept])
+        self.even: list[NDArray[np.float32]] = []
+        self.local: list[NDArray[np.float32]] = []
+        self.uniform: NDArray[np.float32] | None = None
         self._light: tuple[NDArray[np.float32], float] | None = None
         self._weights: NDArray[np.float64] | None = None
         self._one: NDArray[np.float32] | None = None
         self._two: NDArray[np.float32] | None = None
+        self._room: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
 
     def set_light(self, environment: NDArray[np.float32], rotate: float) -> None:
         if self._light is not None and self._light[0] is environment and self._light[1] == rotate:
@@ -155,14 +169,12 @@ class _Tensors:
         coarse = cell_radiance(sky.flux, CELLS, COARSE).astype(np.float32)
         lamps = np.eye(3, dtype=np.float32)[: self.asset.lamps]
         light = np.concatenate([self.basis.T @ fine, lamps])  # (L, 3)
-        reduced = np.matmul(light.T, self.first["light_factor"])  # (C, 3, light eigenvectors)
-        core = self.first["core"]
-        one = np.matmul(reduced, core.reshape(len(core), core.shape[1], -1))
-        self._one = one.reshape(len(core), 3, -1, self.q, self.s)
-        if self.second:
-            core = self.second["core"]
+        reduced = np.matmul(light.T, self.light_factor)  # (C, 3, light eigenvectors)
+        one = np.matmul(reduced, self.core)
+        self._one = one.reshape(len(one), 3, -1, self.q, self.asset.order**2)
+        if self.second is not None:
             light = np.concatenate([coarse, lamps])
-            parts = core.reshape(*core.shape[:2], -1, len(light), self.q)
+            parts = self.second.reshape(*self.second.shape[:2], -1, len(light), self.q)
             self._two = np.einsum("crxlq,lk->crxqk", parts, light, optimize=True)
 
     def set_materials(self, weights: NDArray[np.float64]) -> None:
@@ -172,69 +184,89 @@ class _Tensors:
         self._weights = weights
         h = weights.astype(np.float32)
         assert self._one is not None
-        self.fields = [self._spread(self.first["receiver_factor"], np.einsum("ckvqs,qk->cvsk", self._one, h))]
+        self.even, self.local, self.uniform = [], [], None
+        self._spread(self.rows[0], np.einsum("ckvqs,qk->cvks", self._one, h, optimize=True))
         if self._two is not None:
             c, r = self._two.shape[:2]
             parts = self._two.reshape(c, r, self.q, -1, self.q, 3)  # second channel, harmonic, first channel
-            both = np.einsum("crasbk,ak,bk->crsk", parts, h, h, optimize=True)
-            self.fields.append(self._spread(self.second["receiver_factor"], both))
+            self._spread(self.rows[1], np.einsum("crasbk,ak,bk->crks", parts, h, h, optimize=True))
 
-    def _spread(self, receivers: Factors, values: NDArray[np.float32]) -> _Fields:
-        """From (C, eigenvectors, S, 3) to all receivers."""
-        c, v, s, _ = values.shape
-        world = np.empty((len(self.receiver), s, 3), np.float32)
-        flat = np.ascontiguousarray(values.reshape(c, v, s * 3))
-        for k in range(c):
-            rows = self.receiver[self.start[k] : self.start[k + 1]]
-            world[rows] = (receivers[k, : len(rows)] @ flat[k]).reshape(-1, s, 3)
-        if s == 1:
-            even = np.maximum(world[:, 0], 0.0)
-            return _Fields(even, (even[self.lobed] * np.float32(np.sqrt(4.0 * np.pi)))[:, None])
-        even = np.empty((len(world), 3), np.float32)
-        local = np.empty((len(self.lobed), s, 3), np.float32)
+    def _spread(self, rows: Factors, values: NDArray[np.float32]) -> None:
+        """From (C, eigenvectors, 3, S) to all receivers."""
+        c, v, _, s = values.shape
+        flat = np.ascontiguousarray(values, np.float32).reshape(c, v, 3 * s)
+        k = len(self.even)
+        if len(self._room) == k:  # memory is taken once: fresh pages would cost more than filling them
+            self._room.append((np.empty((len(rows), 3), np.float32), np.empty((len(self.lobed), 3, s), np.float32)))
+        ordered, local = self._room[k]
 
         def part(a: int, b: int) -> None:
-            _even(world[a:b], self.even_weights[a:b], even[a:b])
+            _spread(
+                a, b, rows, self.cluster, flat, self.even_weights, ordered, self.lobe_row, self.rotations, local
+            )  # fmt: skip
 
-        def turn(a: int, b: int) -> None:
-            _rotate(world, self.lobed[a:b], self.rotations[a:b], local[a:b])
+        in_parts(part, len(rows), self.asset.threads)
+        even = np.empty_like(ordered)
+        even[self.receiver] = ordered
+        self.even.append(even)
+        if s == 1:
+            self.uniform = local[:, :, 0]
+        else:
+            self.local.append(local)
 
-        in_parts(part, len(world), self.asset.threads)
-        in_parts(turn, len(self.lobed), self.asset.threads)
-        return _Fields(even, local)
+
+LOBED = ("blinn-phong", "cook-torrance", "phong")
+
+
+def _bands(order: int) -> NDArray[np.int64]:
+    """Band of every harmonic, (order^2,)."""
+    return np.repeat(np.arange(order), 2 * np.arange(order) + 1)
 
 
 def _factors(store: formats.Store, name: str) -> Factors:
-    return formats.dequantise(store.read(name), store.read(f"{name}_scale"))
+    codes, scale = store.read(name), store.read(f"{name}_scale")
+    values: Factors = codes.astype(np.float32) * scale
+    return values
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
-def _even(world, weights, out):  # type: ignore[no-untyped-def]
-    for i in range(len(world)):
-        r = g = b = np.float32(0.0)
-        for s in range(weights.shape[1]):
-            w = weights[i, s]
-            r += w * world[i, s, 0]
-            g += w * world[i, s, 1]
-            b += w * world[i, s, 2]
-        zero = np.float32(0.0)
-        out[i, 0], out[i, 1], out[i, 2] = max(r, zero), max(g, zero), max(b, zero)
-
-
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
-def _rotate(world, rows, rotations, out):  # type: ignore[no-untyped-def]
-    """Band by band: a rotation does not mix them."""
-    for i in range(len(rows)):
-        x = world[rows[i]]
-        low, band = 0, 0
-        while low < rotations.shape[1]:
-            high = low + 2 * band + 1
-            for j in range(low, high):
-                r = g = b = np.float32(0.0)
-                for s in range(low, high):
-                    w = rotations[i, j, s]
-                    r += w * x[s, 0]
-                    g += w * x[s, 1]
-                    b += w * x[s, 2]
-                out[i, j, 0], out[i, j, 1], out[i, j, 2] = r, g, b
-            low, band = high, band + 1
+def _spread(first, last, rows, cluster, flat, even_weights, even, lobe_row, rotations, local):  # type: ignore[no-untyped-def]
+    size = flat.shape[2]
+    count = size // 3
+    world = np.empty(size, np.float32)
+    zero = np.float32(0.0)
+    for i in range(first, last):
+        world[:] = zero
+        vectors = flat[cluster[i]]
+        for v in range(0, rows.shape[1] - 3, 4):  # four at a time: fewer passes over the sums
+            w0, w1, w2, w3 = rows[i, v], rows[i, v + 1], rows[i, v + 2], rows[i, v + 3]
+            f0, f1, f2, f3 = vectors[v], vectors[v + 1], vectors[v + 2], vectors[v + 3]
+            for k in range(size):
+                world[k] += (w0 * f0[k] + w1 * f1[k]) + (w2 * f2[k] + w3 * f3[k])
+        for v in range(rows.shape[1] // 4 * 4, rows.shape[1]):
+            w0, f0 = rows[i, v], vectors[v]
+            for k in range(size):
+                world[k] += w0 * f0[k]
+        row = lobe_row[i]
+        for colour in range(3):
+            light = world[colour * count : (colour + 1) * count]
+            total = light[0]  # of a uniform value: the mean itself
+            if count > 1:
+                total = zero
+                for k in range(count):
+                    total += even_weights[i, k] * light[k]
+            even[i, colour] = max(total, zero)
+            if row >= 0:
+                target = local[row, colour]
+                target[:] = zero
+                if count == 1:
+                    target[0] = max(total, zero)
+                    continue
+                at = low = band = 0
+                while low < count:
+                    n = 2 * band + 1  # harmonics of the band
+                    for k in range(n):
+                        for j in range(n):
+                            target[low + j] += rotations[row, at + k * n + j] * light[low + k]
+                    at += n * n
+                    low, band = low + n, band + 1

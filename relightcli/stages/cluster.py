@@ -30,6 +30,7 @@ TERMS = 16  # eigenvectors of a cluster when receivers are grouped
 SKETCH = 128  # random directions that stand in for a receiver's tensor
 SAMPLE = 1024  # receivers whose full tensors show what light they react to
 RECEIVERS_PER_CLUSTER = 1000
+LARGEST = 2.0  # a cluster with more than so many times the mean is cut: the cost goes with the square
 
 
 @dataclass(frozen=True)
@@ -91,10 +92,14 @@ def cluster(config: Config) -> dict[str, Any]:
             writer.record("light-basis", {"seconds": time.perf_counter() - clock, "error": held_out})
         if "groups" not in writer.done:
             clock = time.perf_counter()
-            found = cpca(_sketch(setup, config), clusters, TERMS, config.seed)
-            writer.put("cluster/label", found.label, dims=("receiver",))
+            rows = _sketch(setup, config)
+            found = cpca(rows, clusters, TERMS, config.seed)
+            label = split_large(rows, found.label, int(LARGEST * len(rows) / found.count) + 1)
+            writer.put("cluster/label", label, dims=("receiver",))
             left = float(np.sqrt(found.residuals[-1] / found.norm2)) if found.norm2 else 0.0
-            writer.record("groups", {"seconds": time.perf_counter() - clock, "clusters": found.count, "error": left})
+            writer.record(
+                "groups", {"seconds": time.perf_counter() - clock, "clusters": int(label.max()) + 1, "error": left}
+            )
         seconds = time.perf_counter() - started
         writer.commit({"seconds": seconds, "resumed": resumed, "workers": config.workers})
     store = formats.open_store(config.output, KIND)
@@ -112,6 +117,24 @@ def cluster(config: Config) -> dict[str, Any]:
     }
 
 
+def split_large(rows: NDArray[np.floating[Any]], label: NDArray[np.int32], most: int) -> NDArray[np.int32]:
+    """Labels with every cluster of more than `most` rows cut into even parts along its first principal direction."""
+    out, new = label.copy(), int(label.max()) + 1
+    for c in range(new):
+        members = np.flatnonzero(label == c)
+        parts = -(-len(members) // most)
+        if parts < 2:
+            continue
+        own = rows[members].astype(np.float64)
+        centred = own - own.mean(0)
+        _, vectors = gram_spectrum(centred.T @ centred)
+        order = members[np.argsort(centred @ vectors[:, 0], kind="stable")]
+        for part in np.array_split(order, parts)[1:]:
+            out[part] = new
+            new += 1
+    return out
+
+
 def _need_bounces(lighting: LightingStore) -> None:
     if "bounce/hit" not in lighting.store:
         raise StoreError(
@@ -122,7 +145,7 @@ def _need_bounces(lighting: LightingStore) -> None:
 def copy_arrays(store: formats.Store, writer: formats.Writer, names: list[str]) -> None:
     """Copies arrays as they are, a range of chunks at a time."""
     for name in names:
-        if f"copy {name}" in writer.done:
+        if f"copy/{name}" in writer.done:
             continue
         source: Any = store.array(name)
         layout = store.layouts[name]
@@ -141,7 +164,7 @@ def copy_arrays(store: formats.Store, writer: formats.Writer, names: list[str]) 
         step = max(1, layout.chunks[0])
         for start in range(0, layout.shape[0], step):
             target[start : start + step] = source[start : start + step]
-        writer.record(f"copy {name}", {})
+        writer.record(f"copy/{name}", {})
 
 
 def _light_basis(setup: TransferSetup, config: Config) -> tuple[NDArray[np.float32], float]:

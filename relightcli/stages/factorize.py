@@ -125,7 +125,7 @@ def _one_bounce(
         clusters,
         {"core": "int8"},
     )
-    todo = [c for c in range(clusters) if f"one-bounce {c}" not in writer.done]
+    todo = [c for c in range(clusters) if f"one-bounce/{c}" not in writer.done]
     if not todo:
         return
     sources = setup.sources(basis)
@@ -143,7 +143,7 @@ def _one_bounce(
         back = np.einsum("ml,nlq->nqm", kept["light_factor"], back, optimize=True)
         error2 = float(((tensor - back).astype(np.float64) ** 2).sum())
         writer.record(
-            f"one-bounce {c}",
+            f"one-bounce/{c}",
             {
                 "seconds": time.perf_counter() - clock,
                 "receivers": len(rows),
@@ -177,7 +177,7 @@ def _two_bounces(
         clusters,
         {},
     )
-    todo = [c for c in range(clusters) if f"two-bounce {c}" not in writer.done]
+    todo = [c for c in range(clusters) if f"two-bounce/{c}" not in writer.done]
     if not todo:
         return
     sources = setup.second_sources(setup.sources(coarse_cells()), bands)
@@ -192,7 +192,7 @@ def _two_bounces(
         back = kept["receiver_factor"][: len(rows)] @ kept["core"]
         error2 = float(((tensor[:, :, 0] - back).astype(np.float64) ** 2).sum())
         writer.record(
-            f"two-bounce {c}",
+            f"two-bounce/{c}",
             {
                 "seconds": time.perf_counter() - clock,
                 "receivers": len(rows),

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import relight_formats as formats
-
 from relightcli.stages.lighting import LightingStore
 from relightcli.stages.outputs import Config, check, check_shots, numbered, output_suffix, resolve_environment
 from relightcli.stages.session import Session

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from relightcli.core.brdf.models import pack_materials
 from relightcli.core.shade.gather import Gather
-from relightcli.core.shade.local import local_radiance
 from relightcli.core.shade.lobe_factors import LobeFactors, local_lobes
+from relightcli.core.shade.local import local_radiance
 from relightcli.core.sphere import cube
 from relightcli.core.transport.channels import light_factors, plan_channels, shiny_models
 from relightcli.core.transport.local_lights import pack_lights
@@ -36,7 +36,8 @@ def coarse_cells() -> NDArray[np.float32]:
     ratio = CELLS // COARSE
     face, row, column = np.meshgrid(np.arange(6), np.arange(CELLS), np.arange(CELLS), indexing="ij")
     cell = ((face * COARSE + row // ratio) * COARSE + column // ratio).reshape(-1)
-    return np.eye(6 * COARSE * COARSE, dtype=np.float32)[cell]
+    rows: NDArray[np.float32] = np.eye(6 * COARSE * COARSE, dtype=np.float32)[cell]
+    return rows
 
 
 def cell_radiance(flux: NDArray[np.float64], resolution: int, cells: int) -> NDArray[np.float64]:
@@ -68,7 +69,7 @@ class TransferSetup:
         self.lamps = LAMP_COLUMNS if scene.lights else 0
         gather = lighting.gather()
         if gather is None:
-            raise StoreError(f"{lighting.store.path}: nothing blocks anything in this scene; it has no interreflections")
+            raise StoreError(f"{lighting.store.path}: nothing blocks anything in it; there are no interreflections")
         self.gather = gather
 
     @property
@@ -129,11 +130,10 @@ class TransferSetup:
         if not len(factor):
             return
         place = np.array([self.model[self.material == m].max(initial=-1) for m in range(len(self.table.model))])
-        own = LobeFactors(place >= 0, self.exits.view_factor[:, 0], self.factors[place], np.ones((len(place), 3)))
+        white = np.ones((len(place), 3), np.float32)
+        own = LobeFactors(place >= 0, self.exits.view_factor[:, 0], self.factors[place], white)
         lobe = np.zeros((len(factor), 6, self.factors.shape[2]), np.float32)
-        local_lobes(
-            bits, lights, lighting.position, lighting.normal, self.material, own, lobe, self.row, self.threads
-        )
+        local_lobes(bits, lights, lighting.position, lighting.normal, self.material, own, lobe, self.row, self.threads)
         for f, (side, term) in enumerate(used):
             factor[:, f, -LAMP_COLUMNS:] = lobe[:, 3 * side : 3 * side + 3, term]
 

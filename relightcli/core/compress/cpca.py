@@ -2,8 +2,8 @@
 
     x  ~  mu_c + E_c E_c' (x - mu_c)
 
-Lloyd's scheme: a cluster's mean and its leading eigenvectors E_c, then every row to the cluster that leaves least of it.
-Neither step can raise the total residual.
+Lloyd's scheme: a cluster's mean and its leading eigenvectors E_c, then every row to the cluster that leaves least of
+it. Neither step can raise the total residual.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ def cpca(rows: NDArray[np.floating], clusters: int, terms: int, seed: int = 0) -
             least[worst] = 0.0
         if len(residuals) > 1 and residuals[-2] - residuals[-1] <= _CONVERGED * residuals[-2]:
             break
-    used, label = np.unique(label, return_inverse=True)
-    return Clusters(label.astype(np.int32), len(used), tuple(residuals), norm2)
+    used, compact = np.unique(label, return_inverse=True)
+    return Clusters(compact.astype(np.int32), len(used), tuple(residuals), norm2)
 
 
 def _subspace(own: NDArray[np.float64], terms: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
@@ -123,8 +123,6 @@ def _plus_plus(
     return np.array(centres)
 
 
-def _nearest(
-    x: NDArray[np.float64], square: NDArray[np.float64], centres: NDArray[np.float64]
-) -> NDArray[np.int32]:
+def _nearest(x: NDArray[np.float64], square: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.int32]:
     distance = square[:, None] - 2.0 * (x @ centres.T) + (centres**2).sum(1)
     return distance.argmin(1).astype(np.int32)

@@ -69,6 +69,7 @@ def response(model: int, row: NDArray[np.float64], order: int) -> NDArray[np.flo
 
 def shade_low_order(
     light: NDArray[np.float32],
+    uniform: NDArray[np.float32],
     normals: NDArray[np.float32],
     view: NDArray[np.float32],
     table: NDArray[np.float32],
@@ -76,23 +77,25 @@ def shade_low_order(
     material: NDArray[np.int32],
     threads: int = 1,
 ) -> NDArray[np.float32]:
-    """Specular exit radiance (n, 3) float32 towards view (n, 3) of light (n, order^2, 3) in the receivers' frames.
+    """Specular exit radiance (2, n, 3) float32 towards view (n, 3): of light (n, 3, order^2) in the receivers' frames,
+    and of light that is the same from everywhere, uniform (n, 3).
 
     normals (n, 3); table (M, POLAR, B) from `response`; colour (M, 3), the specular colour; material (n,).
     """
-    out = np.empty((len(light), 3), np.float32)
-    order = math.isqrt(light.shape[1])
+    out = np.empty((2, len(light), 3), np.float32)
+    order = math.isqrt(light.shape[2])
 
     def part(a: int, b: int) -> None:
-        _shade(light[a:b], normals[a:b], view[a:b], table, colour, material[a:b], order, out[a:b])
+        _shade(light[a:b], uniform[a:b], normals[a:b], view[a:b], table, colour, material[a:b], order, out[:, a:b])
 
     in_parts(part, len(light), threads)
     return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
-def _shade(light, normals, view, table, colour, material, order, out):  # type: ignore[no-untyped-def]
+def _shade(light, uniform, normals, view, table, colour, material, order, out):  # type: ignore[no-untyped-def]
     c, s = np.empty(order, np.float32), np.empty(order, np.float32)
+    even = np.float32(math.sqrt(4.0 * math.pi))
     for i in range(len(light)):
         axes = axes_of((np.float64(normals[i, 0]), np.float64(normals[i, 1]), np.float64(normals[i, 2])))
         x = y = z = 0.0
@@ -100,8 +103,9 @@ def _shade(light, normals, view, table, colour, material, order, out):  # type: 
             x += axes[0][k] * view[i, k]
             y += axes[1][k] * view[i, k]
             z += axes[2][k] * view[i, k]
-        out[i] = np.float32(0.0)
         if not z > 0.0:
+            for k in range(3):
+                out[0, i, k] = out[1, i, k] = np.float32(0.0)
             continue
         length = math.sqrt(x * x + y * y)
         scale = 1.0 / length if length > 0.0 else 0.0
@@ -122,9 +126,11 @@ def _shade(light, normals, view, table, colour, material, order, out):  # type: 
                 w = low[k] + f * (high[k] - low[k])
                 k += 1
                 wc, ws = w * c[m], w * s[m]
-                r += wc * light[i, middle + m, 0] + ws * light[i, middle - m, 0]
-                gr += wc * light[i, middle + m, 1] + ws * light[i, middle - m, 1]
-                b += wc * light[i, middle + m, 2] + ws * light[i, middle - m, 2]
-        out[i, 0] = r * colour[material[i], 0]
-        out[i, 1] = gr * colour[material[i], 1]
-        out[i, 2] = b * colour[material[i], 2]
+                r += wc * light[i, 0, middle + m] + ws * light[i, 0, middle - m]
+                gr += wc * light[i, 1, middle + m] + ws * light[i, 1, middle - m]
+                b += wc * light[i, 2, middle + m] + ws * light[i, 2, middle - m]
+        m = material[i]
+        out[0, i, 0], out[0, i, 1], out[0, i, 2] = r * colour[m, 0], gr * colour[m, 1], b * colour[m, 2]
+        w = even * (low[0] + f * (high[0] - low[0]))
+        for k in range(3):
+            out[1, i, k] = w * uniform[i, k] * colour[m, k]

@@ -59,13 +59,12 @@ def plan_channels(
         first = [channel(-1, DIFFUSE, t) for t in ones]
     for m in fixed:
         for k, t in enumerate(ones):
-            along = lambda column: float(table.parameters[m, column : column + 3] @ t / (t @ t))  # noqa: B023, E731
             tint = k if textured[m] else -1
-            rows[m].append((first[k], DIFFUSE, along(DIFFUSE_COLUMN), tint))
+            rows[m].append((first[k], DIFFUSE, _along(table, m, DIFFUSE_COLUMN, t), tint))
             if table.model[m] == TRANSLUCENT:
-                rows[m].append((first[k], THROUGH, along(TRANSMITTANCE_COLUMN), -1))
+                rows[m].append((first[k], THROUGH, _along(table, m, TRANSMITTANCE_COLUMN, t), -1))
             if table.model[m] in SHINY:
-                rows[m].append((first[k], SPECULAR, along(SPECULAR_COLUMN), -1))
+                rows[m].append((first[k], SPECULAR, _along(table, m, SPECULAR_COLUMN, t), -1))
         if table.model[m] in SHINY:
             basis = transport_basis(int(table.model[m]), functions)
             weights = mix(basis, table.parameters[m], int(table.model[m]))
@@ -101,6 +100,11 @@ def plan_channels(
     place = np.array([models.index(int(code)) if code in models else -1 for code in table.model], np.int32)
     channels = Channels(np.array(material, np.int32), np.array(part, np.int32), np.array(tone).reshape(-1, 3))
     return channels, exits, place
+
+
+def _along(table: MaterialTable, material: int, column: int, tone: NDArray[np.float64]) -> float:
+    """A colour of a material in units of a tone (3,)."""
+    return float(table.parameters[material, column : column + 3] @ tone / (tone @ tone))
 
 
 def shiny_models(table: MaterialTable, adjustable: Sequence[bool]) -> list[int]:
@@ -140,9 +144,7 @@ def coefficients(channels: Channels, table: MaterialTable, functions: int = FUNC
     return out
 
 
-def _common_colour(
-    table: MaterialTable, fixed: Sequence[int], textured: Sequence[bool]
-) -> NDArray[np.float64] | None:
+def _common_colour(table: MaterialTable, fixed: Sequence[int], textured: Sequence[bool]) -> NDArray[np.float64] | None:
     """The colour (3,) that all fixed materials have, up to brightness; None if they differ, are textured or shine."""
     colours = []
     for m in fixed:

@@ -1,4 +1,4 @@
-"""Transfer tensors: exit radiance of interreflections per light, material region and BRDF function. [Sun 2007, sec. 3.3]
+"""Transfer tensors: interreflections per light, material region and BRDF function. [Sun 2007, sec. 3.3]
 
     T1_x(q, s, l) = int y_s(w) [exit radiance of y(x, w) in channel q, light l]                           one bounce
     T2_x(q2, s, l, q1) = the same, with T1 of the receivers as their light                                two bounces
@@ -46,9 +46,11 @@ class Exits(NamedTuple):
 
 
 class Sources(NamedTuple):
-    """What receivers have gathered, per light l: even (N, L) float32, irradiance over pi; factor (G, F, L) float32 per
-    used light factor of the receivers with a lobe, at row (N,), -1 for the others; used (F, 2) int64, whether cosine (0)
-    or sine (1), and the term; partner (N,) int64, the receiver on the other side."""
+    """What receivers have gathered, per light l.
+
+    even (N, L) float32, irradiance over pi; factor (G, F, L) float32, per used light factor, of the receivers with a
+    lobe, at row (N,), -1 for the others; used (F, 2) int64, whether cosine (0) or sine (1), and the term; partner (N,)
+    int64, the receiver on the other side."""
 
     even: NDArray[np.float32]
     factor: NDArray[np.float32]

@@ -37,10 +37,11 @@ def test_specular_exit_radiance_is_the_integral_over_the_light(model: int, width
     view = np.array([n + 0.8 * v for n, v in zip(normals, random_unit(rng, 5), strict=True)])
     view /= np.linalg.norm(view, axis=1, keepdims=True)
     world = rng.standard_normal((5, ORDER**2, 3))
-    local = np.einsum("nij,njc->nic", local_rotations(normals, ORDER), world).astype(np.float32)
+    local = np.einsum("nij,njc->nci", local_rotations(normals, ORDER), world).astype(np.float32)
     table = response(model, row, ORDER)[None]
-    got = shade_low_order(
-        local, normals, view.astype(np.float32), table, np.ones((1, 3), np.float32), np.zeros(5, np.int32)
+    one = np.ones((1, 3), np.float32)
+    got, uniform = shade_low_order(
+        local, np.repeat(one, 5, 0), normals, view.astype(np.float32), table, one, np.zeros(5, np.int32)
     )
     light = np.einsum("ds,nsc->ndc", sh.harmonics(DIRECTIONS, ORDER), world)
     for i in range(5):
@@ -49,6 +50,7 @@ def test_specular_exit_radiance_is_the_integral_over_the_light(model: int, width
         expected = (lobe * SOLID) @ light[i]
         scale = float((lobe * SOLID).sum()) * float(np.sqrt((light[i] ** 2).mean()))
         assert np.abs(got[i] - expected).max() <= 0.02 * scale
+        assert np.abs(uniform[i] - (lobe * SOLID).sum()).max() <= 0.02 * (lobe * SOLID).sum()
 
 
 def test_rotated_coefficients_give_the_same_function() -> None:
