@@ -30,6 +30,13 @@ from relightcli.cli import options
     type=click.IntRange(0, 4),
     help="Bands of spherical harmonics for the second bounce; 0 is a uniform value.",
 )
+@click.option(
+    "--coefficients",
+    default=96,
+    show_default=True,
+    type=click.IntRange(1, 1 << 16),
+    help="Haar coefficients of direct light kept per receiver and light factor.",
+)
 @click.option("--dry-run", is_flag=True, help="Say what would be made; do nothing.")
 @options.workers
 @options.overwrite

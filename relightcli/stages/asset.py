@@ -4,7 +4,8 @@
     new materials       channels weighted and summed, clusters to receivers; what follows
     new view            specular lobes towards it
 
-[Sun 2007, sec. 4, Eq. 3-4]. Direct light comes from the visibility in the asset, as in a transfer store.
+[Sun 2007, sec. 4, Eq. 3-4]. Direct light comes from tensors too (`direct_tensors`), or with the basis visibility from
+the bits in the asset, as in a transfer store.
 """
 
 from __future__ import annotations
@@ -19,13 +20,14 @@ from numpy.typing import NDArray
 import relight_formats as formats
 from relightcli.core.brdf.models import SPECULAR as SPECULAR_COLUMN
 from relightcli.core.brdf.separable import POLAR
-from relightcli.core.lights.environment import latlong_to_cube
+from relightcli.core.lights.environment import SkyCube, latlong_to_cube
 from relightcli.core.shade.gather import in_parts
 from relightcli.core.shade.low_order import response, shade_low_order
 from relightcli.core.transport.channels import SHINY, coefficients, plan_channels
 from relightcli.core.transport.transfer import even_projection, local_rotations
 from relightcli.errors import InputError
 from relightcli.scene.model import Material
+from relightcli.stages.direct_tensors import DirectTensors
 from relightcli.stages.lighting import LightingStore, Radiance, _Coats
 from relightcli.stages.transfer_setup import CELLS, COARSE, LAMP_COLUMNS, cell_radiance
 
@@ -47,6 +49,9 @@ class AssetStore(LightingStore):
         self.channels, _, _ = plan_channels(table, [m.adjustable for m in materials], textured, self.functions)
         self.lamps = LAMP_COLUMNS if self.scene.lights else 0
         self._tensors: _Tensors | None = None
+        self._direct_store: DirectTensors | None = None
+        self._direct_sky: SkyCube | None = None
+        self._lit: tuple[NDArray[np.float32], float, SkyCube] | None = None
 
     def exit_radiance(
         self,
@@ -70,20 +75,64 @@ class AssetStore(LightingStore):
                     f"material {material.name}: is {material.model} now, and the asset was made for {model}; "
                     "use the transfer store it came from"
                 )
-        parts = super().exit_radiance(environment, rotate, materials, view, active, basis, 0)
+        coats = self._coats(listed)
+        if basis is None:
+            if coats.shiny.any() and view is None:
+                raise InputError("a material with a specular lobe looks different from everywhere: name a --camera")
+            sky = self._sky_of(environment, rotate)
+            parts = [self._direct_tensors(sky, environment, rotate, coats, view, active)]
+        else:
+            parts = super().exit_radiance(environment, rotate, materials, view, active, basis, 0)
+            sky = self._sky_of(environment, rotate)
         if bounces == 0:
             return parts
-        coats = self._coats(listed)
         if self._tensors is None:
             self._tensors = _Tensors(self)
         tensors = self._tensors
-        tensors.set_light(environment, rotate)
+        tensors.set_light(sky)
         tensors.set_materials(coefficients(self.channels, coats.table, self.functions))
         shines = bool(coats.shiny.any()) and view is not None
         specular = self._specular(coats, view) if shines else [None] * len(tensors.even)
         for even, lobes in zip(tensors.even[:bounces], specular[:bounces], strict=True):
             parts.append(Radiance(coats.diffuse(even * np.float32(np.pi)), lobes))
         return parts
+
+    def _sky_of(self, environment: NDArray[np.float32], rotate: float) -> SkyCube:
+        if self._lit is None or self._lit[0] is not environment or self._lit[1] != rotate:
+            self._lit = (environment, rotate, latlong_to_cube(environment, self.resolution, rotate))
+        return self._lit[2]
+
+    def _direct_tensors(
+        self,
+        sky: SkyCube,
+        environment: NDArray[np.float32],
+        rotate: float,
+        coats: _Coats,
+        view: NDArray[np.float32] | None,
+        active: NDArray[np.bool_] | None,
+    ) -> Radiance:
+        """Direct light from the tensors; from the bits for lobes of models that have none."""
+        if self._direct_store is None:
+            self._direct_store = DirectTensors(self)
+        direct = self._direct_store
+        if self._direct_sky is not sky:
+            direct.set_light(sky)
+            self._direct_sky = sky
+        e = direct.even * np.float32(np.pi)
+        lamp_e, lamps = self._lamps(coats, view, active)
+        if lamp_e is not None:
+            e = e + lamp_e
+        diffuse = coats.diffuse(e)
+        if not coats.shiny.any() or view is None:
+            return Radiance(diffuse, None)
+        specular, known = direct.specular(coats.table, view)
+        rest = coats.shiny & ~known if active is None else coats.shiny & ~known & active
+        if rest.any():
+            specular += self._exact_specular(sky, environment, rotate, coats, view, np.flatnonzero(rest))
+        if lamps is not None:
+            colours = coats.table.parameters[:, SPECULAR_COLUMN : SPECULAR_COLUMN + 3].astype(np.float32)
+            specular += lamps * colours[coats.material]
+        return Radiance(diffuse, specular)
 
     def _specular(self, coats: _Coats, view: NDArray[np.float32] | None) -> list[NDArray[np.float32] | None]:
         """Specular exit radiance after every bounce."""
@@ -154,19 +203,18 @@ class _Tensors:
         self.even: list[NDArray[np.float32]] = []
         self.local: list[NDArray[np.float32]] = []
         self.uniform: NDArray[np.float32] | None = None
-        self._light: tuple[NDArray[np.float32], float] | None = None
+        self._sky: SkyCube | None = None
         self._weights: NDArray[np.float64] | None = None
         self._one: NDArray[np.float32] | None = None
         self._two: NDArray[np.float32] | None = None
         self._room: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
 
-    def set_light(self, environment: NDArray[np.float32], rotate: float) -> None:
-        if self._light is not None and self._light[0] is environment and self._light[1] == rotate:
+    def set_light(self, sky: SkyCube) -> None:
+        if self._sky is sky:
             return
-        self._light, self._weights = (environment, rotate), None
-        sky = latlong_to_cube(environment, CELLS, rotate)
-        fine = cell_radiance(sky.flux, CELLS, CELLS).astype(np.float32)
-        coarse = cell_radiance(sky.flux, CELLS, COARSE).astype(np.float32)
+        self._sky, self._weights = sky, None
+        fine = cell_radiance(sky.flux, sky.resolution, CELLS).astype(np.float32)
+        coarse = cell_radiance(sky.flux, sky.resolution, COARSE).astype(np.float32)
         lamps = np.eye(3, dtype=np.float32)[: self.asset.lamps]
         light = np.concatenate([self.basis.T @ fine, lamps])  # (L, 3)
         reduced = np.matmul(light.T, self.light_factor)  # (C, 3, light eigenvectors)

@@ -19,8 +19,10 @@ import relight_formats as formats
 from relightcli import __version__
 from relightcli.adapters.files import need_output
 from relightcli.core.compress.tucker import hooi
+from relightcli.core.transport.direct_tensor import KEEP
 from relightcli.errors import InputError, StoreError
 from relightcli.stages.cluster import copy_arrays
+from relightcli.stages.direct_tensors import put_direct
 from relightcli.stages.lighting import LightingStore
 from relightcli.stages.transfer_setup import COARSE, TransferSetup, coarse_cells
 
@@ -38,6 +40,7 @@ class Config:
     eigenvectors: int = 32
     light_rank: int = 64
     second_order: int = 0
+    coefficients: int = KEEP
     workers: int = 1
     overwrite: bool = False
     dry_run: bool = False
@@ -62,6 +65,7 @@ def factorize(config: Config) -> dict[str, Any]:
         "eigenvectors": config.eigenvectors,
         "light_rank": config.light_rank,
         "second_order": config.second_order,
+        "coefficients": config.coefficients,
     }
     read: Any = store.read
     label: NDArray[np.int32] = read("cluster/label")
@@ -93,6 +97,7 @@ def factorize(config: Config) -> dict[str, Any]:
         basis: NDArray[np.float32] = read("light/basis")
         writer.put("one_bounce/basis", basis, dims=("light_cell", "light"))
         bands = int(store.settings["order"])
+        put_direct(writer, lighting, config.coefficients, config.workers)
         if bounces:
             _one_bounce(config, writer, setup, basis, order, start, bands)
         if bounces > 1:

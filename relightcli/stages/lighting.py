@@ -146,6 +146,15 @@ class LightingStore:
             rows = slice(start, min(start + self._chunk, len(self)))
             yield rows, np.asarray(array[rows])
 
+    def bits_of(self, receivers: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
+        """Visibility bits of some receivers, rising indices."""
+        parts = []
+        for block, bits in self.blocks():
+            own = receivers[(receivers >= block.start) & (receivers < block.stop)]
+            if len(own):
+                parts.append(bits[own - block.start])
+        return np.concatenate(parts)
+
     def exit_radiance(
         self,
         environment: NDArray[np.float32],
@@ -202,24 +211,28 @@ class LightingStore:
         if partner is not None and active is not None:
             active = active | active[partner]  # light comes through from the other side
         e = self._irradiance(sky, active, basis)
-        lamps = None
-        if "lights/bits" in self.store:
-            lamp_e, lamps = local_radiance(
-                self.store.read("lights/bits"),
-                pack_lights(self.scene.lights.values()),
-                self.position,
-                self.normal,
-                view,
-                material,
-                table,
-                np.ones(len(self), bool) if active is None else active,
-                self.threads,
-            )
+        lamp_e, lamps = self._lamps(coats, view, active)
+        if lamp_e is not None:
             e = e + lamp_e
         diffuse = coats.diffuse(e)
         if not coats.shiny.any() or view is None:
             return Radiance(diffuse, None)
         rows = np.flatnonzero(coats.shiny if looked_at is None else coats.shiny & looked_at)
+        specular = self._exact_specular(sky, environment, rotate, coats, view, rows)
+        if lamps is not None:
+            specular += lamps * table.parameters[material][:, SPECULAR : SPECULAR + 3].astype(np.float32)
+        return Radiance(diffuse, specular)
+
+    def _exact_specular(
+        self,
+        sky: SkyCube,
+        environment: NDArray[np.float32],
+        rotate: float,
+        coats: _Coats,
+        view: NDArray[np.float32],
+        rows: NDArray[np.int64],
+    ) -> NDArray[np.float32]:
+        """Specular light of the sky at `rows`, integrated from the bits, (N, 3); 0 elsewhere."""
         specular = np.zeros((len(self), 3), np.float32)
         tree = sky_tree(splat(sky), environment, rotate)
         for block, bits in self.blocks():
@@ -230,14 +243,30 @@ class LightingStore:
                     pick - block.start,
                     self.normal[pick],
                     view[pick],
-                    material[pick],
-                    table,
+                    coats.material[pick],
+                    coats.table,
                     tree,
                     self.threads,
                 )
-        if lamps is not None:
-            specular += lamps * table.parameters[material][:, SPECULAR : SPECULAR + 3].astype(np.float32)
-        return Radiance(diffuse, specular)
+        return specular
+
+    def _lamps(
+        self, coats: _Coats, view: NDArray[np.float32] | None, active: NDArray[np.bool_] | None
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]] | tuple[None, None]:
+        """Irradiance (N, 3) of the local lights, and their specular light without its colour; None without lights."""
+        if "lights/bits" not in self.store:
+            return None, None
+        return local_radiance(
+            self.store.read("lights/bits"),
+            pack_lights(self.scene.lights.values()),
+            self.position,
+            self.normal,
+            view,
+            coats.material,
+            coats.table,
+            np.ones(len(self), bool) if active is None else active,
+            self.threads,
+        )
 
     def _bounces(
         self,

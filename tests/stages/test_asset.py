@@ -38,7 +38,8 @@ def transfer(tmp_path_factory):
     smooth = (1.0 + 0.5 * np.sin(width / 5.0))[..., None] * [0.7, 0.9, 1.2] * (1.5 - height / 16.0)[..., None]
     maps = {"smooth": smooth, "patchy": np.kron(np.random.default_rng(0).random((8, 16, 3)) ** 3, np.ones((4, 4, 1)))}
     folder = tmp_path_factory.mktemp("scene")
-    return make_store(write_scene(folder, parts, [CAMERA], maps, adjustable=True, more=LAMP), workers=2, bounces=2)
+    scene = write_scene(folder, parts, [CAMERA], maps, adjustable=True, more=LAMP)
+    return make_store(scene, workers=2, bounces=2, light_resolution=32, bounce_resolution=8)
 
 
 @pytest.fixture(scope="module")
@@ -82,9 +83,7 @@ def test_pictures_of_the_asset_beside_those_of_the_transfer_store(transfer, asse
 def test_tensors_carry_the_energy_of_matte_surfaces(transfer):
     """The mean of one and two bounces, uncompressed, is what receivers gather under even light."""
     lighting = LightingStore(transfer, 2)
-    materials = {
-        k: dataclasses.replace(m, specular=(0.0, 0.0, 0.0)) for k, m in lighting.scene.materials.items()
-    }
+    materials = {k: dataclasses.replace(m, specular=(0.0, 0.0, 0.0)) for k, m in lighting.scene.materials.items()}
     setup = TransferSetup(lighting, 4, 2)
     weights = coefficients(setup.channels, pack_materials(list(materials.values())), 4)
     view = np.tile(np.float32([0, 1, 0]), (len(lighting), 1))

@@ -35,7 +35,14 @@ def test_planes_are_found_and_the_residual_never_rises() -> None:
 
 @pytest.mark.parametrize(
     "x",
-    [np.zeros((7, 3)), np.ones((7, 3)), np.eye(3)[[0, 0, 1, 1, 2]], 1e-30 * np.eye(4), 1e12 * np.eye(4), np.ones((1, 5))],
+    [
+        np.zeros((7, 3)),
+        np.ones((7, 3)),
+        np.eye(3)[[0, 0, 1, 1, 2]],
+        1e-30 * np.eye(4),
+        1e12 * np.eye(4),
+        np.ones((1, 5)),
+    ],
     ids=["zero", "constant", "duplicates", "tiny", "large", "one row"],
 )
 def test_more_clusters_and_terms_than_the_data_have(x: np.ndarray) -> None:

@@ -1,0 +1,173 @@
+"""Direct light of an asset: transfer tensors of its receivers, written by factorize and read by relight.
+
+Receivers are in groups: one for each family of BRDFs with a tensor, and one, "matte", for all others, which have the
+diffuse factor alone. [Sun 2007, sec. 3.2, 4.1; `core.transport.direct_tensor`]
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import relight_formats as formats
+from relightcli.core.brdf.direct_model import FAMILIES, LightFactors, MaterialSetting, light_factors, setting
+from relightcli.core.brdf.models import F0, ROUGHNESS, SHININESS, MaterialTable
+from relightcli.core.brdf.models import SPECULAR as SPECULAR_COLUMN
+from relightcli.core.lights.environment import SkyCube
+from relightcli.core.lights.prefiltered import prefiltered_sky
+from relightcli.core.transport.direct_tensor import direct_light, direct_transfer, light_coefficients, shade_direct
+from relightcli.core.transport.lobe_visibility import add_lobes, lobe_visibility, table_side
+from relightcli.stages.brdf_data import direct_model, put_model, read_model
+from relightcli.stages.lighting import LightingStore
+
+MATTE = "matte"
+BLOCK = 2048
+
+
+def group_of(lighting: LightingStore) -> dict[str, NDArray[np.int64]]:
+    """Receivers of every group that has any."""
+    models = np.array([m.model for m in lighting.scene.materials.values()])
+    may_shine = np.array(
+        [m.adjustable or any(c > 0.0 for c in m.specular) for m in lighting.scene.materials.values()], bool
+    )
+    material = lighting.geometry.material[lighting.object]
+    family = np.where(np.isin(models, FAMILIES) & may_shine, models, MATTE)[material]
+    return {name: np.flatnonzero(family == name) for name in (*FAMILIES, MATTE) if (family == name).any()}
+
+
+def put_direct(writer: formats.Writer, lighting: LightingStore, keep: int, threads: int) -> None:
+    """Computes and writes the tensors of all groups, a block of receivers at a time."""
+    for name, receivers in group_of(lighting).items():
+        if name == MATTE:
+            factors = LightFactors(np.full((2, 2, 1), 1.0 / np.pi, np.float32), np.ones(1, np.float32))
+            degrees: list[float] = []
+        else:
+            model = direct_model(name)
+            put_model(writer, model, f"direct/{name}/brdf/")
+            factors, degrees = light_factors(model), model.degrees.tolist()
+        count, n = factors.table.shape[2], len(receivers)
+        texels = 6 * lighting.resolution**2
+        kept = min(keep, texels)
+        group = f"direct/{name}"
+        writer.put(f"{group}/receiver", receivers.astype(np.int32), dims=(f"{name}_receiver",))
+
+        def array(
+            leaf: str, shape: tuple[int, ...], dtype: str, dims: tuple[str, ...], group: str = group, name: str = name
+        ) -> Any:
+            return writer.array(
+                f"{group}/{leaf}",
+                shape=shape,
+                dtype=dtype,
+                chunks=(BLOCK, *shape[1:]),
+                dims=(f"{name}_receiver", *dims),
+                codec="zstd",
+            )
+
+        index = array("index", (n, kept), "uint16" if texels <= 1 << 16 else "int32", ("coefficient",))
+        scale = array("scale", (n, count), "float32", ("factor",))
+        value = array("value", (n, count, kept), "int8", ("factor", "coefficient"))
+        wide = [d for d in degrees if d > 0.0]
+        lobes = [
+            array(f"lobe_{d:g}", (n, table_side(d), table_side(d)), "uint8", (f"row_{d:g}", f"column_{d:g}"))
+            for d in wide
+        ]
+        for start in range(0, n, BLOCK):
+            block = f"direct/{name}-{start}"
+            if block in writer.done:
+                continue
+            clock = time.perf_counter()
+            own = receivers[start : start + BLOCK]
+            bits, normals = lighting.bits_of(own), lighting.normal[own]
+            rows = slice(start, start + len(own))
+            index[rows], scale[rows], value[rows] = direct_transfer(bits, normals, factors, keep, threads)
+            for target, table in zip(lobes, lobe_visibility(bits, normals, degrees, threads), strict=True):
+                target[rows] = table
+            writer.record(block, {"seconds": time.perf_counter() - clock, "receivers": len(own)})
+
+
+class DirectTensors:
+    """The tensors in memory; what depends on the light is kept until `set_light`."""
+
+    def __init__(self, lighting: LightingStore) -> None:
+        self.lighting = lighting
+        store = lighting.store
+        names = (*FAMILIES, MATTE)
+        self.groups = [_Group(lighting, name) for name in names if f"direct/{name}/receiver" in store]
+        self.even = np.zeros((len(lighting), 3), np.float32)
+
+    def set_light(self, sky: SkyCube) -> None:
+        """`even` (N, 3) becomes the irradiance over pi; the lobes get their skies."""
+        light = light_coefficients(sky.radiance())
+        for group in self.groups:
+            group.set_light(sky, light, self.lighting.threads)
+            self.even[group.receiver] = np.maximum(group.incident[:, -1], 0.0)
+
+    def specular(
+        self, table: MaterialTable, view: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Specular exit radiance (N, 3) towards view (N, 3), and which receivers have one from here, (N,)."""
+        out = np.zeros((len(self.lighting), 3), np.float32)
+        known = np.zeros(len(self.lighting), bool)
+        for group in self.groups:
+            if group.name != MATTE:
+                out[group.receiver] = np.maximum(group.specular(table, view, self.lighting.threads), 0.0)
+                known[group.receiver] = True
+        return out, known
+
+
+class _Group:
+    def __init__(self, lighting: LightingStore, name: str) -> None:
+        self.name = name
+        read: Any = lighting.store.read
+        self.receiver: NDArray[np.int32] = read(f"direct/{name}/receiver")
+        self.index, self.scale = read(f"direct/{name}/index"), read(f"direct/{name}/scale")
+        self.value = read(f"direct/{name}/value")
+        self.normal = np.ascontiguousarray(lighting.normal[self.receiver])
+        material = lighting.geometry.material[lighting.object[self.receiver]]
+        self.rows = {int(m): np.flatnonzero(material == m) for m in np.unique(material)}
+        self.incident = np.zeros((*self.scale.shape, 3), np.float32)
+        self.skies: tuple[NDArray[np.float32], ...] = ()
+        self._settings: dict[tuple[float, ...], MaterialSetting] = {}
+        if name != MATTE:
+            self.model = read_model(lighting.store, f"direct/{name}/brdf/")
+            self.degrees = self.model.degrees.tolist()
+            self.bits = lighting.bits_of(self.receiver)
+            self.tables = tuple(read(f"direct/{name}/lobe_{d:g}") for d in self.degrees if d > 0.0)
+            self.out = np.empty((len(self.receiver), 3), np.float32)
+
+    def set_light(self, sky: SkyCube, light: NDArray[np.float32], threads: int) -> None:
+        direct_light(self.index, self.scale, self.value, light, self.incident, threads)
+        if self.name != MATTE:
+            self.skies = prefiltered_sky(sky, self.degrees, threads=threads)
+
+    def specular(self, table: MaterialTable, view: NDArray[np.float32], threads: int) -> NDArray[np.float32]:
+        towards = view[self.receiver]
+        black = np.zeros(3, np.float32)
+        for m, rows in self.rows.items():
+            row = table.parameters[m]
+            colour = row[SPECULAR_COLUMN : SPECULAR_COLUMN + 3].astype(np.float32)
+            if not colour.any():
+                self.out[rows] = 0.0
+                continue
+            values = (row[SHININESS],) if self.name == "blinn-phong" else (row[F0], row[ROUGHNESS])
+            if values not in self._settings:
+                self._settings = {values: setting(self.model, *(float(v) for v in values))}
+            tables = self._settings[values]
+            shade_direct(self.incident, towards, self.normal, rows, tables.view_table, colour, black, self.out, threads)
+            add_lobes(
+                self.bits,
+                self.tables,
+                self.skies,
+                self.degrees,
+                towards,
+                self.normal,
+                rows,
+                tables.energy,
+                colour,
+                self.out,
+                threads,
+            )
+        return self.out
