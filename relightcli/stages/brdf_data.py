@@ -1,0 +1,101 @@
+"""Factorised sets of materials, made once per user and kept as stores of kind `brdf` in a cache folder.
+
+The folder is $RELIGHTCLI_CACHE, else $XDG_CACHE_HOME/relightcli, else ~/.cache/relightcli. A store is named after what
+it was made from, so that nothing in the folder is ever out of date; all of it can be deleted at any time. Where the
+folder cannot be written the model is made anew every time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import uuid
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import relight_formats as formats
+from relightcli import __version__
+from relightcli.core.brdf import direct_model as model
+from relightcli.core.brdf.disc import RESOLUTION
+from relightcli.core.brdf.specular_lobes import LOBES
+from relightcli.errors import StoreError
+
+KIND = "brdf"
+
+
+def direct_model(
+    family: str,
+    ranks: tuple[int, int, int] | None = None,
+    degrees: Sequence[float] = LOBES,
+    measured: bool = False,
+    resolution: int = RESOLUTION,
+) -> model.DirectModel:
+    """The model of a family, "cook-torrance" or "blinn-phong", from the cache or made now.
+
+    ranks, degrees, resolution: as in `build_direct_model`; measured: the set of measured materials, which are all
+    Cook-Torrance, in place of the family's own. Raises InputError for an unknown family.
+    """
+    points = model.measured_points() if measured else model.default_points(family)
+    ranks = ranks or model.RANKS.get(family)
+    settings = {
+        "family": family,
+        "points": points.tolist(),
+        "ranks": ranks,
+        "degrees": [float(degree) for degree in degrees],
+        "resolution": resolution,
+        "version": model.VERSION,
+    }
+    path = cache_folder() / f"{family}-{formats.fingerprint_json(settings).removeprefix('sha256:')[:20]}.zarr"
+    found = _load(path, settings)
+    if found is None:
+        found = model.build_direct_model(family, points, ranks, degrees, resolution)
+        # A cache that is full, read-only or busy is no reason to fail.
+        with contextlib.suppress(OSError, StoreError):
+            _save(path, settings, found)
+    return found
+
+
+def cache_folder() -> Path:
+    """Where models are kept; it need not exist."""
+    own, base = os.environ.get("RELIGHTCLI_CACHE"), os.environ.get("XDG_CACHE_HOME")
+    if own:
+        return Path(own)
+    return (Path(base) if base else Path.home() / ".cache") / "relightcli"
+
+
+def _load(path: Path, settings: dict[str, Any]) -> model.DirectModel | None:
+    """None where there is no store, or one that is damaged."""
+    try:
+        store = formats.open_store(path, KIND)
+        arrays = {name: store.read(name) for name in model.ARRAYS}
+    except (OSError, StoreError):
+        return None
+    return model.from_arrays(settings["family"], settings["resolution"], arrays)
+
+
+def _save(path: Path, settings: dict[str, Any], made: model.DirectModel) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.exists():
+        if _load(path, settings) is not None:  # another process was faster
+            return
+        _remove(path)
+    program = f"relightcli {__version__}"
+    writer = formats.begin(path, KIND, settings=settings, inputs={}, program=program, overwrite=True)
+    if writer is None:
+        return
+    with writer:
+        for name, values in made.arrays().items():
+            writer.put(name, values, dims=model.ARRAYS[name])
+        writer.commit({"error": float(made.error.max())})
+
+
+def _remove(path: Path) -> None:
+    """Out of the way first, by one rename: nobody reads half a store."""
+    away = path.with_name(f"{path.name}.{uuid.uuid4().hex}.damaged")
+    os.rename(path, away)
+    if away.is_dir():
+        shutil.rmtree(away)
+    else:
+        away.unlink()
