@@ -1,76 +1,101 @@
-"""BRDF models for direct light, built when a scene needs one and kept in a cache between runs.
+"""Factorised sets of materials, made once per user and kept as stores of kind `brdf` in a cache folder.
 
-The cache is a folder of stores of kind "brdf": $RELIGHTCLI_CACHE, else $XDG_CACHE_HOME/relightcli, else
-~/.cache/relightcli. A store is named by what decides its content. Where nothing can be written, models are built anew.
+The folder is $RELIGHTCLI_CACHE, else $XDG_CACHE_HOME/relightcli, else ~/.cache/relightcli. A store is named after what
+it was made from, so that nothing in the folder is ever out of date; all of it can be deleted at any time. Where the
+folder cannot be written the model is made anew every time.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import shutil
+import uuid
+from collections.abc import Sequence
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 import relight_formats as formats
 from relightcli import __version__
-from relightcli.core.brdf.direct_model import (
-    ARRAYS,
-    RANKS,
-    DirectModel,
-    build_direct_model,
-    default_points,
-    from_arrays,
-)
+from relightcli.core.brdf import direct_model as model
 from relightcli.core.brdf.disc import RESOLUTION
 from relightcli.core.brdf.specular_lobes import LOBES
 from relightcli.errors import StoreError
 
 KIND = "brdf"
-VERSION = 1  # of how models are built
 
 
-def direct_model(family: str, ranks: tuple[int, int, int] | None = None) -> DirectModel:
-    """The model of a family with its default data set. ranks: for reflectance, view and light; None: the family's."""
+def direct_model(
+    family: str,
+    ranks: tuple[int, int, int] | None = None,
+    degrees: Sequence[float] = LOBES,
+    measured: bool = False,
+    resolution: int = RESOLUTION,
+) -> model.DirectModel:
+    """The model of a family, "cook-torrance" or "blinn-phong", from the cache or made now.
+
+    ranks, degrees, resolution: as in `build_direct_model`; measured: the set of measured materials, which are all
+    Cook-Torrance, in place of the family's own. Raises InputError for an unknown family.
+    """
+    points = model.measured_points() if measured else model.default_points(family)
+    ranks = ranks or model.RANKS.get(family)
     settings = {
         "family": family,
-        "resolution": RESOLUTION,
-        "ranks": list(ranks or RANKS[family]),
-        "lobes": list(LOBES),
-        "points": formats.fingerprint_json(default_points(family).tolist()),
-        "version": VERSION,
+        "points": points.tolist(),
+        "ranks": ranks,
+        "degrees": [float(degree) for degree in degrees],
+        "resolution": resolution,
+        "version": model.VERSION,
     }
-    path = cache_folder() / f"{family}-{formats.fingerprint_json(settings).rpartition(':')[2][:16]}.zarr"
-    with contextlib.suppress(StoreError, OSError):  # absent or damaged: it is built
-        return read_model(formats.open_store(path, KIND), "")
-    model = build_direct_model(family, ranks=ranks)
-    with contextlib.suppress(StoreError, OSError):  # no room, or another run is at it
-        path.parent.mkdir(parents=True, exist_ok=True)
-        writer = formats.begin(
-            path, KIND, settings=settings, inputs={}, program=f"relightcli {__version__}", overwrite=True
-        )
-        if writer is not None:
-            with writer:
-                put_model(writer, model, "")
-                writer.commit({})
-    return model
-
-
-def put_model(writer: formats.Writer, model: DirectModel, group: str) -> None:
-    """Writes a model's arrays into a store, `group` (ending in a slash, or empty) before their names."""
-    for name, values in model.arrays().items():
-        writer.put(f"{group}{name}", values, dims=ARRAYS[name], attrs={"family": model.family})
-
-
-def read_model(store: formats.Store, group: str) -> DirectModel:
-    """What `put_model` wrote."""
-    arrays = {name: np.asarray(store.read(f"{group}{name}")) for name in ARRAYS}
-    family = str(store.array(f"{group}core").attrs["family"])
-    return from_arrays(family, RESOLUTION, arrays)
+    path = cache_folder() / f"{family}-{formats.fingerprint_json(settings).removeprefix('sha256:')[:20]}.zarr"
+    found = _load(path, settings)
+    if found is None:
+        found = model.build_direct_model(family, points, ranks, degrees, resolution)
+        # A cache that is full, read-only or busy is no reason to fail.
+        with contextlib.suppress(OSError, StoreError):
+            _save(path, settings, found)
+    return found
 
 
 def cache_folder() -> Path:
-    """Where models are kept."""
-    if os.environ.get("RELIGHTCLI_CACHE"):
-        return Path(os.environ["RELIGHTCLI_CACHE"])
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "relightcli"
+    """Where models are kept; it need not exist."""
+    own, base = os.environ.get("RELIGHTCLI_CACHE"), os.environ.get("XDG_CACHE_HOME")
+    if own:
+        return Path(own)
+    return (Path(base) if base else Path.home() / ".cache") / "relightcli"
+
+
+def _load(path: Path, settings: dict[str, Any]) -> model.DirectModel | None:
+    """None where there is no store, or one that is damaged."""
+    try:
+        store = formats.open_store(path, KIND)
+        arrays = {name: store.read(name) for name in model.ARRAYS}
+    except (OSError, StoreError):
+        return None
+    return model.from_arrays(settings["family"], settings["resolution"], arrays)
+
+
+def _save(path: Path, settings: dict[str, Any], made: model.DirectModel) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.exists():
+        if _load(path, settings) is not None:  # another process was faster
+            return
+        _remove(path)
+    program = f"relightcli {__version__}"
+    writer = formats.begin(path, KIND, settings=settings, inputs={}, program=program, overwrite=True)
+    if writer is None:
+        return
+    with writer:
+        for name, values in made.arrays().items():
+            writer.put(name, values, dims=model.ARRAYS[name])
+        writer.commit({"error": float(made.error.max())})
+
+
+def _remove(path: Path) -> None:
+    """Out of the way first, by one rename: nobody reads half a store."""
+    away = path.with_name(f"{path.name}.{uuid.uuid4().hex}.damaged")
+    os.rename(path, away)
+    if away.is_dir():
+        shutil.rmtree(away)
+    else:
+        away.unlink()

@@ -13,14 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 import relight_formats as formats
-from relightcli.core.brdf.direct_model import FAMILIES, LightFactors, MaterialSetting, light_factors, setting
+from relightcli.core.brdf.direct_model import (
+    ARRAYS,
+    FAMILIES,
+    LightFactors,
+    MaterialSetting,
+    from_arrays,
+    light_factors,
+    setting,
+)
+from relightcli.core.brdf.disc import RESOLUTION
 from relightcli.core.brdf.models import F0, ROUGHNESS, SHININESS, MaterialTable
 from relightcli.core.brdf.models import SPECULAR as SPECULAR_COLUMN
 from relightcli.core.lights.environment import SkyCube
 from relightcli.core.lights.prefiltered import prefiltered_sky
 from relightcli.core.transport.direct_tensor import direct_light, direct_transfer, light_coefficients, shade_direct
 from relightcli.core.transport.lobe_visibility import add_lobes, lobe_visibility, table_side
-from relightcli.stages.brdf_data import direct_model, put_model, read_model
+from relightcli.stages.brdf_data import direct_model
 from relightcli.stages.lighting import LightingStore
 
 MATTE = "matte"
@@ -46,7 +55,8 @@ def put_direct(writer: formats.Writer, lighting: LightingStore, keep: int, threa
             degrees: list[float] = []
         else:
             model = direct_model(name)
-            put_model(writer, model, f"direct/{name}/brdf/")
+            for leaf, values in model.arrays().items():
+                writer.put(f"direct/{name}/brdf/{leaf}", values, dims=ARRAYS[leaf])
             factors, degrees = light_factors(model), model.degrees.tolist()
         count, n = factors.table.shape[2], len(receivers)
         texels = 6 * lighting.resolution**2
@@ -132,7 +142,8 @@ class _Group:
         self.skies: tuple[NDArray[np.float32], ...] = ()
         self._settings: dict[tuple[float, ...], MaterialSetting] = {}
         if name != MATTE:
-            self.model = read_model(lighting.store, f"direct/{name}/brdf/")
+            arrays = {leaf: read(f"direct/{name}/brdf/{leaf}") for leaf in ARRAYS}
+            self.model = from_arrays(name, RESOLUTION, arrays)
             self.degrees = self.model.degrees.tolist()
             self.bits = lighting.bits_of(self.receiver)
             self.tables = tuple(read(f"direct/{name}/lobe_{d:g}") for d in self.degrees if d > 0.0)

@@ -1,16 +1,24 @@
 """One family of materials for direct light: lobes, and light factors shared by all settings. [Sun 2007, sec. 3.2, 4.1]
 
-    f(w_o, w_i) ~ f_s + sum over k of W(w_o, k) U_i(w_i, k),   W = U_o (D x_h u_h)               [Sun 2007, Eq. 2-3]
+    f(w_o, w_i) ~ f_s + sum over k of W(w_o, k) U_i(w_i, k) + W(w_o, K) / pi,   W = U_o (D x_h u_h)    [Sun 2007, Eq. 2]
 
-f_s are the lobes of `specular_lobes`; U_h, U_o, U_i, D a Tucker decomposition of f_r = f - f_s over a set of settings.
-With squared error over the whole set, the few settings with high and narrow lobes would decide: so every entry of the
-set counts in units of its own norm |f_h|, the root of the sum of f^2 dA dA, and U_h is scaled back.
+f_s are the lobes of `specular_lobes`; U_h, U_o, U_i, D a Tucker decomposition, over a set of settings, of f_r = f - f_s
+less its mean over w_i. With squared error over the whole set, the few settings with high and narrow lobes would decide:
+so every entry counts in units of its own norm |f_h|, the root of the sum of f^2 dA dA, and U_h is scaled back.
 
-Between the entries, lobes and u_h are interpolated linearly (`navigation`). The default set of Cook-Torrance is a grid
-of roughness and of f0 in {0, 1}: Schlick's term F = F_0 + f0 (1 - F_0), F_0 = (1 - v.h)^5, is linear in f0, so that two
-values of f0 are all values, and only roughness is interpolated, over its logarithm. Below the least roughness of the
-grid but one, all lobes are narrower than the cells and hardly differ. The default set of Blinn-Phong has exponents
-from 0 to 1e6; interpolation is over the exponent.
+A deviation from the paper: the view factor W(w_o, K) of the diffuse light factor makes the directional albedo
+
+    A(w_o) = integral of f cos(theta_i) dw_i
+
+exact for every view. Least squares with few factors loses energy, a third of it for roughness 0.2, and cells average A
+over views where it is steep; neither costs anything to put right. Lobes and W are scaled by A over its mean over the
+view's cell, and W(w_o, K) is what is then missing.
+
+Between the entries all of this is interpolated linearly (`navigation`). The default set of Cook-Torrance is a grid of
+roughness and of f0 in {0, 1}: Schlick's term F = F_0 + f0 (1 - F_0), F_0 = (1 - v.h)^5, is linear in f0, so that two
+values of f0 are all values, and only roughness is interpolated, over its logarithm. Below roughness 0.01 all lobes are
+narrower than the cells and hardly differ. The default set of Blinn-Phong has exponents from 0 to 1e6; interpolation is
+over the exponent.
 """
 
 from __future__ import annotations
@@ -23,21 +31,29 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from relightcli.core.brdf.albedo import directional_albedo, lobe_share
 from relightcli.core.brdf.dataset import BrdfSet, blinn_phong_set, cook_torrance_set
-from relightcli.core.brdf.disc import RESOLUTION, DiscGrid, disc_grid
+from relightcli.core.brdf.disc import RESOLUTION, DiscGrid, bilinear, disc_grid
 from relightcli.core.brdf.measured import fits
 from relightcli.core.brdf.navigation import Mix, exponent_mix, fresnel_roughness_mix
 from relightcli.core.brdf.specular_lobes import LOBES, fit_lobes, lobes_on_grid
-from relightcli.core.compress.tucker import hooi, mode_product
+from relightcli.core.compress.tucker import hooi, hosvd, mode_product
 from relightcli.errors import InputError
 
 FAMILIES = ("cook-torrance", "blinn-phong")
-# n_h, n_o, n_i. [Sun 2007, sec. 4.3]
-RANKS = {"cook-torrance": (4, 8, 8), "blinn-phong": (3, 8, 8)}
+# n_h, n_o, n_i. The paper has 4 (Cook-Torrance) or 3 (Blinn-Phong), 8, 8. [Sun 2007, sec. 4.3] Only n_i counts at run
+# time, because a material's W is made when it is set; twice the other two take a quarter off the error.
+RANKS = {"cook-torrance": (8, 16, 8), "blinn-phong": (6, 16, 8)}
+# Changes whenever the same arguments give another model.
+VERSION = 1
 ROUGHNESSES = (1e-4, *np.geomspace(0.01, 1.0, 22).tolist(), 2.0, 10.0)
 EXPONENTS = (0.0, *np.geomspace(1.0, 2048.0, 20).tolist(), 6e3, 2e4, 1e5, 1e6)
-# Samples of lobe energies over cos(theta_o).
+# Samples of lobe energies and albedo over cos(theta_o), from 0 to 1.
 POLAR = 64
+# Side of a material's view table.
+VIEW_SIDE = 48
+# What the tensor is cut down to before it is factorised; all that counts is in there.
+_SPAN = (16, 64, 64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +61,8 @@ class DirectModel:
     """parameters (H, d) float64: exponent (d = 1), or f0 and roughness (d = 2), of the entries; reflectance (H, n_h),
     view (n, n_o), light (n, n_i), core (n_h, n_o, n_i) float64: U_h, U_o, U_i, D over the n cells of
     `disc_grid(resolution)`; degrees (L,), radius (R,), energy (H, R, L) float64 as in `SpecularLobes`; importance
-    (n_i,) float64 as in `LightFactors`; error (H,) float64: |f - f^| / |f| of every entry, lobes on both sides.
+    (n_i,) float64 as in `LightFactors`; albedo (H, POLAR) float64: A at cos(theta_o) = k / (POLAR - 1); cell_albedo
+    (H, n) float64: its mean over view cells; error (H,) float64: |f - f^| / |f| of every entry, lobes on both sides.
     """
 
     family: str
@@ -59,6 +76,8 @@ class DirectModel:
     radius: NDArray[np.float64]
     energy: NDArray[np.float64]
     importance: NDArray[np.float64]
+    albedo: NDArray[np.float64]
+    cell_albedo: NDArray[np.float64]
     error: NDArray[np.float64]
 
     def arrays(self) -> dict[str, NDArray[np.float64]]:
@@ -77,6 +96,8 @@ ARRAYS: dict[str, tuple[str, ...]] = {
     "radius": ("radius",),
     "energy": ("entry", "radius", "lobe"),
     "importance": ("light_rank",),
+    "albedo": ("entry", "cosine"),
+    "cell_albedo": ("entry", "cell"),
     "error": ("entry",),
 }
 
@@ -91,9 +112,12 @@ class LightFactors(NamedTuple):
 
 
 class MaterialSetting(NamedTuple):
-    """One material at run time. view_table (D, D, K) float32: W over the grid [column of x, row of y], cells beyond the
-    rim filled with the nearest; energy (POLAR, L) float32: a of the lobes at cos(theta_o) = k / (POLAR - 1); outside:
-    the values are beyond the set, and the nearest ones were taken."""
+    """One material at run time, for specular colour 1.
+
+    view_table (S, S, K+1) float32: W at the points p = (x, y) / sqrt(1 + z) of a grid of S x S nodes over [-1, 1]^2,
+    [row of x, column of y]; nodes beyond the disc have what is at its rim. Equal areas, and smooth in z at the rim.
+    energy (POLAR, L) float32: a of the lobes at cos(theta_o) = k / (POLAR - 1). outside: the values are beyond the
+    set, and the nearest ones were taken."""
 
     view_table: NDArray[np.float32]
     energy: NDArray[np.float32]
@@ -148,13 +172,14 @@ def _factorise(
     norm = np.sqrt(np.einsum("hoi,hoi->h", brdfs.values, brdfs.values)) * grid.area
     norm[norm == 0.0] = 1.0
     unit = norm if weighted else np.full(len(norm), math.sqrt(float((norm**2).mean())))
+    cell_albedo = brdfs.values.sum(2) * grid.area
     remainder = brdfs.values - lobes_on_grid(grid, lobes)
+    remainder -= remainder.mean(2, keepdims=True)
     remainder /= unit[:, None, None]
-    tucker = hooi(remainder.astype(np.float32), ranks, paired=(1, 2))
-    u_h, u_o, u_i = tucker.factors
-    assert u_h is not None
-    assert u_o is not None
-    assert u_i is not None
+    # In two steps: the sweeps are then over a small tensor.
+    span = hosvd(remainder.astype(np.float32), tuple(max(a, b) for a, b in zip(ranks, _SPAN, strict=True)), (1, 2))
+    tucker = hooi(span.core, ranks, paired=(1, 2))
+    u_h, u_o, u_i = (_product(a, b) for a, b in zip(span.factors, tucker.factors, strict=True))
     # |X - X^|^2 entry by entry, with X projected on U_o and U_i: what is left out, and what differs within.
     within = mode_product(mode_product(remainder, u_i.T, 2), u_o.T, 1)
     near = mode_product(tucker.core, u_h, 0)
@@ -174,8 +199,16 @@ def _factorise(
         lobes.radius,
         lobes.energy,
         importance,
+        directional_albedo(family, brdfs.parameters, np.linspace(0.0, 1.0, POLAR)),
+        cell_albedo,
         error,
     )
+
+
+def _product(a: NDArray[np.float64] | None, b: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    assert a is not None
+    assert b is not None
+    return a @ b
 
 
 def light_factors(model: DirectModel) -> LightFactors:
@@ -212,14 +245,48 @@ def _is_grid(points: NDArray[np.float64]) -> bool:
 def setting(model: DirectModel, *values: float) -> MaterialSetting:
     """Run-time table of one material: setting(model, f0, roughness) or setting(model, shininess). [Sun 2007, Eq. 3]"""
     found = mix(model, *values)
-    grid = disc_grid(model.resolution)
-    view = model.view @ np.tensordot(found.weights @ model.reflectance, model.core, 1)
-    energy = np.tensordot(found.weights, model.energy, 1)
-    sine = np.sqrt(1.0 - np.linspace(0.0, 1.0, POLAR) ** 2)
-    polar = (
-        np.stack([np.interp(sine, model.radius, a) for a in energy.T], 1) if energy.shape[1] else np.zeros((POLAR, 0))
-    )
-    return MaterialSetting(_dense(grid, view), polar.astype(np.float32), found.outside)
+    weights, grid = found.weights, disc_grid(model.resolution)
+    tensor = np.tensordot(weights @ model.reflectance, model.core, 1)
+    at_cells = np.concatenate([model.view @ tensor, (weights @ model.cell_albedo)[:, None]], axis=1)
+    cosine = np.linspace(0.0, 1.0, POLAR)
+    albedo = weights @ model.albedo
+    share = np.stack([lobe_share(degrees, cosine) for degrees in model.degrees], 1) if len(model.degrees) else None
+
+    # Lobes: their nodes are rings of cells.
+    ring = np.rint((grid.position**2).sum(1) * grid.resolution**2)
+    rings, inverse = np.unique(ring, return_inverse=True)
+    ring_albedo = np.bincount(inverse, at_cells[:, -1]) / np.bincount(inverse)
+    sine = np.sqrt(1.0 - cosine**2)
+    mean_albedo = np.interp(sine, np.sqrt(rings) / grid.resolution, ring_albedo)
+    scale = np.divide(albedo, mean_albedo, out=np.ones(POLAR), where=mean_albedo > 0.0)
+    energy = np.zeros((POLAR, len(model.degrees)))
+    of_lobes = np.zeros(POLAR)
+    for k in range(len(model.degrees)):
+        energy[:, k] = scale * np.interp(sine, model.radius, weights @ model.energy[:, :, k])
+        if share is not None:
+            of_lobes += share[:, k] * energy[:, k]
+
+    # The tensor's part, and the albedo that is missing.
+    view = _view_nodes()
+    index, part = bilinear(grid, view)
+    at_nodes = np.einsum("nc,nck->nk", part, at_cells[index])
+    exact = np.interp(view[:, 2], cosine, albedo)
+    scale = np.divide(exact, at_nodes[:, -1], out=np.ones(len(view)), where=at_nodes[:, -1] > 0.0)
+    table = at_nodes[:, :-1] * scale[:, None]
+    of_tensor = table @ (model.light.sum(0) * grid.area)
+    missing = exact - np.interp(view[:, 2], cosine, of_lobes) - of_tensor
+    table = np.concatenate([table, missing[:, None]], axis=1).reshape(VIEW_SIDE, VIEW_SIDE, -1)
+    return MaterialSetting(table.astype(np.float32), energy.astype(np.float32), found.outside)
+
+
+def _view_nodes() -> NDArray[np.float64]:
+    """Directions (S S, 3) of the nodes of a view table."""
+    axis = np.linspace(-1.0, 1.0, VIEW_SIDE)
+    p = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+    radius2 = (p**2).sum(1)
+    p /= np.sqrt(np.maximum(radius2, 1.0))[:, None]
+    z = np.maximum(1.0 - radius2, 0.0)
+    return np.concatenate([p * np.sqrt(1.0 + z)[:, None], z[:, None]], axis=1)
 
 
 def _dense(grid: DiscGrid, cells: NDArray[np.float64]) -> NDArray[np.float32]:

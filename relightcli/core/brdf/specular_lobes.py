@@ -80,7 +80,7 @@ def lobe_columns(grid: DiscGrid, degrees: Sequence[float]) -> NDArray[np.float64
         if degree == 0.0:
             out[np.arange(len(out)), k, grid.mirror[grid.octant]] = 1.0
             continue
-        local, weight = _lobe_samples(degree)
+        local, weight = gaussian_samples(degree)
         for row, view in zip(out, views, strict=True):
             inside = view[view[:, 2] > 0.0]
             r = inside * (-1.0, -1.0, 1.0)
@@ -95,7 +95,7 @@ def lobe_columns(grid: DiscGrid, degrees: Sequence[float]) -> NDArray[np.float64
     return out
 
 
-def _lobe_samples(degrees: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def gaussian_samples(degrees: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Directions (s, 3) about the third axis and weights (s,), summing to 1, that integrate G_k."""
     sigma = math.radians(degrees) / 3.0
     # Rings of equal energy of the planar Gaussian, corrected by sin(t)/t.

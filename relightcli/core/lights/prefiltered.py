@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -24,11 +25,12 @@ from relightcli.core.lights.environment import SkyCube
 from relightcli.core.shade.gather import in_parts
 from relightcli.core.sphere import cube
 
+# exp(x) as (1 + x / 2^10)^(2^10): within 1e-3 of the peak.
+_POWER = 1024.0
 # A lobe is summed over this many standard deviations.
 _REACH = 4.5
 # Node spacing in standard deviations, on the mean; and what source texels may be at most.
 _SPACING, _SOURCE = 0.6, 0.62
-_ENTRIES = 1024
 
 
 def prefiltered_sky(
@@ -45,19 +47,26 @@ def prefiltered_sky(
 
 
 def _corners(sky: SkyCube) -> NDArray[np.float32]:
+    around, share = _meeting_texels(sky.resolution)
+    radiance = (sky.flux / np.tile(cube.solid_angles(sky.resolution).reshape(-1), 6)[:, None]).astype(np.float32)
+    out = np.zeros((len(around), 4), np.float32)
+    for k in range(8):
+        out[:, :3] += share[:, k, None] * radiance[around[:, k]]
     r = sky.resolution
+    return out.reshape(6, r + 1, r + 1, 4)
+
+
+@lru_cache(maxsize=2)
+def _meeting_texels(r: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Texels (m, 8) around the nodes of an R x R grid per face, some repeated, and their shares of the solid angle."""
     node = _nodes(r).reshape(-1, 3)
     # A step from a corner to each side finds the texels that meet there.
     step = np.stack(np.meshgrid((-1.0, 1.0), (-1.0, 1.0), (-1.0, 1.0), indexing="ij"), -1).reshape(-1, 3) / (8.0 * r)
     around = np.sort(cube.texel_index(node[:, None] + step, r), axis=1)
     first = np.ones(around.shape, bool)
     first[:, 1:] = around[:, 1:] != around[:, :-1]
-    solid = np.tile(cube.solid_angles(r).reshape(-1), 6)
-    total = (solid[around] * first).sum(1)
-    out = np.zeros((len(node), 4), np.float32)
-    for c in range(3):
-        out[:, c] = (sky.flux[:, c][around] * first).sum(1) / total
-    return out.reshape(6, r + 1, r + 1, 4)
+    weight = np.tile(cube.solid_angles(r).reshape(-1), 6)[around] * first
+    return around, (weight / weight.sum(1, keepdims=True)).astype(np.float32)
 
 
 def _gaussian(sky: SkyCube, degrees: float, threads: int) -> NDArray[np.float32]:
@@ -74,26 +83,30 @@ def _gaussian(sky: SkyCube, degrees: float, threads: int) -> NDArray[np.float32]
     length = np.sqrt((moment**2).sum(1, keepdims=True))
     center = cube.texel_directions(source).reshape(-1, 3)
     direction = np.where(length > 0.0, moment / np.where(length > 0.0, length, 1.0), center)
-    # The kernel over the squared chord, q = 2 - 2 cos, normalised over the sphere: dw = pi dq.
-    end = min(4.0, 4.0 * math.sin(min(math.pi, _REACH * narrow) / 2.0) ** 2)
-    chord2 = np.linspace(0.0, end, _ENTRIES + 2)
-    kernel = np.exp(-0.5 * (2.0 * np.arcsin(0.5 * np.sqrt(chord2)) / narrow) ** 2)
-    kernel /= math.pi * np.trapezoid(kernel, chord2)
     tile = max(1, source // 8)
     tiles = cube.texel_directions(source // tile).reshape(-1, 3)
     node = _nodes(n).reshape(-1, 3).astype(np.float32)
     out = np.zeros((len(node), 4), np.float32)
+    # exp(-t^2 / (2 sigma^2)) over its integral, with x = 2 - 2 cos t for t^2 as in `_convolve`.
+    end = min(math.pi, _REACH * narrow)
+    t = np.linspace(0.0, end, 4001)
+    scale = 1.0 / (2.0 * math.pi * float(np.trapezoid(np.exp(-0.5 * (t / narrow) ** 2) * np.sin(t), t)))
     arguments = (
-        np.concatenate([direction, flux], axis=1).astype(np.float32),
+        _by_tile(np.concatenate([direction, scale * flux], axis=1), source, tile),
         tiles.astype(np.float32),
-        np.float32(math.cos(min(math.pi, _REACH * narrow + 1.5 / (source // tile)))),
-        kernel.astype(np.float32),
-        np.float32(_ENTRIES / end),
-        source,
-        tile,
+        np.float32(math.cos(min(math.pi, end + 1.5 / (source // tile)))),
+        np.float32(2.0 - 2.0 * math.cos(end)),
+        np.float32(-0.5 / (narrow * narrow * _POWER)),
     )
     in_parts(lambda a, b: _convolve(node[a:b], *arguments, out[a:b]), len(node), threads)
     return out.reshape(6, n + 1, n + 1, 4)
+
+
+def _by_tile(values: NDArray[np.float64], source: int, tile: int) -> NDArray[np.float32]:
+    """Per tile of texels, which are in rows: (tiles, 6, tile tile) float32 of values (6 R R, 6)."""
+    side = source // tile
+    found = values.reshape(6, side, tile, side, tile, 6).transpose(0, 1, 3, 5, 2, 4)
+    return np.ascontiguousarray(found.reshape(6 * side * side, 6, tile * tile), np.float32)
 
 
 def _nodes(n: int) -> NDArray[np.float64]:
@@ -103,29 +116,35 @@ def _nodes(n: int) -> NDArray[np.float64]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
-def _convolve(node, light, tiles, near, kernel, per_chord2, source, tile, out):  # type: ignore[no-untyped-def]
-    side = source // tile
-    two = np.float32(2.0)
-    last = np.float32(len(kernel) - 2)
+def _convolve(node, light, tiles, near, end, exponent, out):  # type: ignore[no-untyped-def]
+    """light (tiles, 6, texels): direction, and flux over the kernel's integral. The exponential is a power, so that the
+    loop over a tile becomes vector instructions."""
+    one, two = np.float32(1.0), np.float32(2.0)
     for m in range(len(node)):
         x, y, z = node[m, 0], node[m, 1], node[m, 2]
         red = green = blue = np.float32(0.0)
         for c in range(len(tiles)):
             if x * tiles[c, 0] + y * tiles[c, 1] + z * tiles[c, 2] < near:
                 continue
-            face, row, column = c // (side * side), (c // side) % side, c % side
-            for a in range(tile):
-                first = (face * source + row * tile + a) * source + column * tile
-                for t in range(first, first + tile):
-                    cosine = x * light[t, 0] + y * light[t, 1] + z * light[t, 2]
-                    place = max(two - two * cosine, np.float32(0.0)) * per_chord2
-                    if place >= last:
-                        continue
-                    g = int(place)
-                    w = kernel[g] + (place - np.float32(g)) * (kernel[g + 1] - kernel[g])
-                    red += w * light[t, 3]
-                    green += w * light[t, 4]
-                    blue += w * light[t, 5]
+            of = light[c]
+            for t in range(of.shape[1]):
+                q = max(two - two * (x * of[0, t] + y * of[1, t] + z * of[2, t]), np.float32(0.0))
+                # t^2 = q + q^2 / 12 + q^3 / 90 + ... of the chord's square q
+                w = one + exponent * q * (one + q * (np.float32(1.0 / 12.0) + q * np.float32(1.0 / 90.0)))
+                w *= w
+                w *= w
+                w *= w
+                w *= w
+                w *= w
+                w *= w
+                w *= w
+                w *= w
+                w *= w
+                w *= w
+                w = w if q < end else np.float32(0.0)
+                red += w * of[3, t]
+                green += w * of[4, t]
+                blue += w * of[5, t]
         out[m, 0], out[m, 1], out[m, 2] = red, green, blue
 
 

@@ -1,6 +1,6 @@
 """Direct light of adjustable glossy materials by precomputed transfer tensors. [Sun 2007, Eq. 3-4, sec. 4.1]
 
-    B(w_o) = kd I0(K) + ks sum over k < K of W(w_o, k) I0(k),   I0(k) = sum over t of T(t, k) L(t),
+    B(w_o) = kd I0(K) + ks sum over k of W(w_o, k) I0(k),   I0(k) = sum over t of T(t, k) L(t),
     T(t, k) = V(t) U(k, w_t) (n.w_t)+ dOmega(t)
 
 for the texels t of the sky cube, the K light factors U of a `DirectModel` and, as factor K, the diffuse 1/pi. W are the
@@ -17,6 +17,7 @@ parts of the picture are added up.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -136,7 +137,7 @@ def shade_direct(
     """Sets out[rows] to the exit radiance of one material without its lobes; other rows stay. [Sun 2007, Eq. 3]
 
     incident (N, K+1, 3): I0; views, normals (N, 3) float32 unit; rows (M,): receivers that have the material;
-    view_table (D, D, K) float32 of `direct_model.setting`; specular (3,); albedo (3,) or (N, 3); out (N, 3) float32.
+    view_table (S, S, K+1) float32 of `direct_model.setting`; specular (3,); albedo (3,) or (N, 3); out (N, 3) float32.
     Where n.v is not above 0 it is 0. Truncation can make it negative; it is cut off at 0 after lobes are added.
     """
     colour = np.ascontiguousarray(np.atleast_2d(albedo), np.float32)
@@ -277,19 +278,26 @@ def _direct_light(index, scale, value, light, out):  # type: ignore[no-untyped-d
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
 def _shade(incident, views, normals, rows, view_table, specular, albedo, out):  # type: ignore[no-untyped-def]
-    size, count = view_table.shape[0], view_table.shape[2]
+    count = view_table.shape[2]
+    one = np.float32(1.0)
+    center = np.float32(0.5) * np.float32(view_table.shape[0] - 1)
+    top = np.float32(view_table.shape[0]) - np.float32(1.0001)
     textured = len(albedo) > 1
     for m in range(len(rows)):
         i = rows[m]
         s, t, n = axes_of((normals[i, 0], normals[i, 1], normals[i, 2]))
         vx, vy, vz = views[i, 0], views[i, 1], views[i, 2]
-        if not n[0] * vx + n[1] * vy + n[2] * vz > 0.0:
+        z = np.float32(n[0] * vx + n[1] * vy + n[2] * vz)
+        if not z > np.float32(0.0):
             out[i] = np.float32(0.0)
             continue
-        x = np.float32(s[0] * vx + s[1] * vy + s[2] * vz)
-        y = np.float32(t[0] * vx + t[1] * vy + t[2] * vz)
-        a, b, fa, fb = place_on_disc(x, y, size)
-        one = np.float32(1.0)
+        scale = center / np.float32(math.sqrt(one + z))
+        fa = np.float32(s[0] * vx + s[1] * vy + s[2] * vz) * scale + center
+        fb = np.float32(t[0] * vx + t[1] * vy + t[2] * vz) * scale + center
+        fa = min(max(fa, np.float32(0.0)), top)
+        fb = min(max(fb, np.float32(0.0)), top)
+        a, b = int(fa), int(fb)
+        fa, fb = fa - np.float32(a), fb - np.float32(b)
         c00, c01, c10, c11 = view_table[a, b], view_table[a, b + 1], view_table[a + 1, b], view_table[a + 1, b + 1]
         red = green = blue = np.float32(0.0)
         for k in range(count):
@@ -298,6 +306,6 @@ def _shade(incident, views, normals, rows, view_table, specular, albedo, out):  
             green += w * incident[i, k, 1]
             blue += w * incident[i, k, 2]
         p = i if textured else 0
-        out[i, 0] = specular[0] * red + albedo[p, 0] * incident[i, count, 0]
-        out[i, 1] = specular[1] * green + albedo[p, 1] * incident[i, count, 1]
-        out[i, 2] = specular[2] * blue + albedo[p, 2] * incident[i, count, 2]
+        out[i, 0] = specular[0] * red + albedo[p, 0] * incident[i, count - 1, 0]
+        out[i, 1] = specular[1] * green + albedo[p, 1] * incident[i, count - 1, 1]
+        out[i, 2] = specular[2] * blue + albedo[p, 2] * incident[i, count - 1, 2]

@@ -104,22 +104,24 @@ def add_lobes(
     """
     words = np.ascontiguousarray(bits).reshape(len(bits), -1)
     ks = np.asarray(specular, np.float32)
-    place = 0
-    for k, degree in enumerate(degrees):
-        table = np.zeros((0, 0, 0), np.uint8)
-        if degree > 0.0:
-            table = tables[place]
-            place += 1
-        strength = np.ascontiguousarray(energy[:, k])
-        if strength.max() <= _NEGLIGIBLE * energy.max():
-            continue
+    wide = iter(tables)
+    of_lobe = [next(wide) if degree > 0.0 else None for degree in degrees]
+    used = [k for k in range(len(degrees)) if energy[:, k].max() > _NEGLIGIBLE * energy.max()]
+    strength = np.ascontiguousarray(energy.T)
 
-        def part(
-            a: int, b: int, k: int = k, table: NDArray[np.uint8] = table, strength: NDArray[np.float32] = strength
-        ) -> None:
-            _add_lobe(words, table, skies[k], views, normals, rows[a:b], bits.shape[2], strength, ks, out)
+    def part(a: int, b: int) -> None:
+        mirror = np.empty((b - a, 6), np.float32)
+        share = np.empty(b - a, np.float32)
+        _mirrors(views, normals, rows[a:b], mirror)
+        for k in used:
+            table = of_lobe[k]
+            if table is None:
+                _share_of_bits(words, rows[a:b], bits.shape[2], mirror, share)
+            else:
+                _share_of_table(table, rows[a:b], mirror, share)
+            _add_lobe(skies[k], rows[a:b], mirror, share, strength[k], ks, out)
 
-        in_parts(part, len(rows), threads)
+    in_parts(part, len(rows), threads)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
@@ -150,59 +152,75 @@ def _open(words, i, texel):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
-def _add_lobe(words, table, sky, views, normals, rows, resolution, strength, specular, out):  # type: ignore[no-untyped-def]
-    one, half, zero = np.float32(1.0), np.float32(0.5), np.float32(0.0)
-    polar = np.float32(len(strength) - 1)
-    nodes = np.float32(sky.shape[1] - 1)
-    side = table.shape[1]
+def _mirrors(views, normals, rows, mirror):  # type: ignore[no-untyped-def]
+    """Of the mirror direction (M, 6): x, y, z in the receiver's frame; face of the cube, and s and t on it."""
+    two = np.float32(2.0)
     for m in range(len(rows)):
         i = rows[m]
         s, t, n = axes_of((normals[i, 0], normals[i, 1], normals[i, 2]))
         vx, vy, vz = views[i, 0], views[i, 1], views[i, 2]
         z = np.float32(n[0] * vx + n[1] * vy + n[2] * vz)
-        if not z > zero:
+        mirror[m, 0] = -(s[0] * vx + s[1] * vy + s[2] * vz)
+        mirror[m, 1] = -(t[0] * vx + t[1] * vy + t[2] * vz)
+        mirror[m, 2] = z
+        face, u, v = place_on_cube(two * z * n[0] - vx, two * z * n[1] - vy, two * z * n[2] - vz)
+        mirror[m, 3], mirror[m, 4], mirror[m, 5] = face, u, v
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def _share_of_table(table, rows, mirror, share):  # type: ignore[no-untyped-def]
+    one, zero = np.float32(1.0), np.float32(0.0)
+    center = np.float32(0.5) * np.float32(table.shape[1] - 1)
+    top = np.float32(table.shape[1]) - np.float32(1.0001)
+    for m in range(len(rows)):
+        x, y, z = mirror[m, 0], mirror[m, 1], max(mirror[m, 2], zero)
+        scale = center / (abs(x) + abs(y) + z)
+        b = max(min((x + y) * scale + center, top), zero)
+        c = max(min((x - y) * scale + center, top), zero)
+        g, h = int(b), int(c)
+        b, c = b - np.float32(g), c - np.float32(h)
+        of = table[rows[m]]
+        low = (one - c) * np.float32(of[g, h]) + c * np.float32(of[g, h + 1])
+        high = (one - c) * np.float32(of[g + 1, h]) + c * np.float32(of[g + 1, h + 1])
+        share[m] = np.float32(1.0 / 255.0) * (low + b * (high - low))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def _share_of_bits(words, rows, resolution, mirror, share):  # type: ignore[no-untyped-def]
+    one, half, zero = np.float32(1.0), np.float32(0.5), np.float32(0.0)
+    size = np.float32(resolution)
+    for m in range(len(rows)):
+        b = max(min((mirror[m, 5] + one) * half * size - half, size - np.float32(1.001)), zero)
+        c = max(min((mirror[m, 4] + one) * half * size - half, size - np.float32(1.001)), zero)
+        g, h = int(b), int(c)
+        b, c = b - np.float32(g), c - np.float32(h)
+        texel = (int(mirror[m, 3]) * resolution + g) * resolution + h
+        low = (one - c) * _open(words, rows[m], texel) + c * _open(words, rows[m], texel + 1)
+        texel += resolution
+        high = (one - c) * _open(words, rows[m], texel) + c * _open(words, rows[m], texel + 1)
+        share[m] = low + b * (high - low)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def _add_lobe(sky, rows, mirror, share, strength, specular, out):  # type: ignore[no-untyped-def]
+    one, half, zero = np.float32(1.0), np.float32(0.5), np.float32(0.0)
+    polar = np.float32(len(strength) - 1)
+    nodes = np.float32(sky.shape[1] - 1)
+    for m in range(len(rows)):
+        z = mirror[m, 2]
+        if not (z > zero and share[m] > zero):
             continue
         p = min(z, np.float32(0.99999)) * polar
         q = int(p)
-        a = strength[q] + (p - np.float32(q)) * (strength[q + 1] - strength[q])
-        rx = np.float32(2.0 * z * n[0] - vx)
-        ry = np.float32(2.0 * z * n[1] - vy)
-        rz = np.float32(2.0 * z * n[2] - vz)
-        face, u, v = place_on_cube(rx, ry, rz)
-        if side > 0:
-            # The mirror direction in the receiver's frame is (-x, -y, z).
-            x = -np.float32(s[0] * vx + s[1] * vy + s[2] * vz)
-            y = -np.float32(t[0] * vx + t[1] * vy + t[2] * vz)
-            scale = half * np.float32(side - 1) / (abs(x) + abs(y) + z)
-            top = np.float32(side) - np.float32(1.0001)
-            b = min((x + y) * scale + half * np.float32(side - 1), top)
-            c = min((x - y) * scale + half * np.float32(side - 1), top)
-            b, c = max(b, zero), max(c, zero)
-            g, h = int(b), int(c)
-            b, c = b - np.float32(g), c - np.float32(h)
-            share = (one - b) * ((one - c) * np.float32(table[i, g, h]) + c * np.float32(table[i, g, h + 1]))
-            share += b * ((one - c) * np.float32(table[i, g + 1, h]) + c * np.float32(table[i, g + 1, h + 1]))
-            share *= np.float32(1.0 / 255.0)
-        else:
-            size = np.float32(resolution)
-            b = min(max((v + one) * half * size - half, zero), size - np.float32(1.001))
-            c = min(max((u + one) * half * size - half, zero), size - np.float32(1.001))
-            g, h = int(b), int(c)
-            b, c = b - np.float32(g), c - np.float32(h)
-            texel = (face * resolution + g) * resolution + h
-            share = (one - b) * ((one - c) * _open(words, i, texel) + c * _open(words, i, texel + 1))
-            texel += resolution
-            share += b * ((one - c) * _open(words, i, texel) + c * _open(words, i, texel + 1))
-        a *= share
-        if a == zero:
-            continue
-        b = min((v + one) * half * nodes, nodes - np.float32(1e-3))
-        c = min((u + one) * half * nodes, nodes - np.float32(1e-3))
-        b, c = max(b, zero), max(c, zero)
+        a = share[m] * (strength[q] + (p - np.float32(q)) * (strength[q + 1] - strength[q]))
+        b = max(min((mirror[m, 5] + one) * half * nodes, nodes - np.float32(1e-3)), zero)
+        c = max(min((mirror[m, 4] + one) * half * nodes, nodes - np.float32(1e-3)), zero)
         g, h = int(b), int(c)
         b, c = b - np.float32(g), c - np.float32(h)
+        face = sky[int(mirror[m, 3])]
         w0, w1, w2, w3 = a * (one - b) * (one - c), a * (one - b) * c, a * b * (one - c), a * b * c
-        e0, e1, e2, e3 = sky[face, g, h], sky[face, g, h + 1], sky[face, g + 1, h], sky[face, g + 1, h + 1]
+        e0, e1, e2, e3 = face[g, h], face[g, h + 1], face[g + 1, h], face[g + 1, h + 1]
+        i = rows[m]
         out[i, 0] += specular[0] * (w0 * e0[0] + w1 * e1[0] + w2 * e2[0] + w3 * e3[0])
         out[i, 1] += specular[1] * (w0 * e0[1] + w1 * e1[1] + w2 * e2[1] + w3 * e3[1])
         out[i, 2] += specular[2] * (w0 * e0[2] + w1 * e1[2] + w2 * e2[2] + w3 * e3[2])
