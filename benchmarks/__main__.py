@@ -26,6 +26,8 @@ NAMES = (
     "accuracy",
     "interreflections",
     "brdf",
+    "asset",
+    "asset_growth",
 )
 PACKAGES = ("relightcli", "numpy", "numba", "zarr", "embreex", "mitsuba", "pyradiance")
 RESULTS = Path("build/bench.json")

@@ -46,6 +46,7 @@ def relight(config: Config) -> dict[str, Any]:
         "open_seconds": opened,
         "lighting_seconds": session.lighting_seconds / len(written),
         "frame_seconds": clocks,
+        "rates": session.rates(),
         "notes": session.notes,
     }
 

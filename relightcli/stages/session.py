@@ -6,6 +6,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -59,6 +60,8 @@ class Session:
         self._maps: dict[str, str] = {}
         self._map: tuple[Path, NDArray[np.float32]] | None = None
         self._radiance: list[NDArray[np.float32]] = []
+        self._last: tuple[object, ...] = ()
+        self._seconds: dict[str, list[float]] = {}
 
     def write(self, shot: Shot, suffix: str) -> str:
         materials = apply_settings(self.lighting.scene.materials, shot.settings)
@@ -102,8 +105,18 @@ class Session:
         radiance = self.lighting.exit_radiance(
             environment, shot.env_rotate, materials, towards, active, self.config.basis, self.config.bounces
         )
-        self.lighting_seconds += time.perf_counter() - clock
+        seconds = time.perf_counter() - clock
+        self.lighting_seconds += seconds
+        now = (id(environment), shot.env_rotate), shot.settings
+        if self._last:
+            kind = "light" if now[0] != self._last[0] else "materials" if now[1] != self._last[1] else "view"
+            self._seconds.setdefault(kind, []).append(seconds)
+        self._last = now
         return radiance
+
+    def rates(self) -> dict[str, float]:
+        """Frames of light per second, median, by what has changed: light, else materials, else view."""
+        return {kind: 1.0 / max(median(seconds), 1e-9) for kind, seconds in self._seconds.items()}
 
     def _view(self, name: str | None) -> _View:
         lighting = self.lighting
