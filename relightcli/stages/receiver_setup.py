@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,13 @@ from relightcli.core.shade import picture, primary
 from relightcli.core.transport.buried import unbury
 from relightcli.core.transport.camera import make_film
 from relightcli.core.transport.hits import Surfaces
-from relightcli.core.transport.receivers import Receivers, receivers_of_vertices, spatial_order, vertex_receivers
+from relightcli.core.transport.receivers import (
+    Receivers,
+    join_receivers,
+    receivers_of_vertices,
+    spatial_order,
+    vertex_receivers,
+)
 from relightcli.core.transport.shading import vertex_colours
 from relightcli.errors import InputError
 from relightcli.scene.model import Geometry, Scene
@@ -23,7 +29,10 @@ PIXEL_GRIDS = (1, 3)  # samples along a pixel's side, inside and at edges, for p
 
 @dataclass(frozen=True)
 class PixelReceivers:
-    """Receivers at what a camera sees, with the picture they belong to; `texture` (N, 3) is the texture's colour."""
+    """Receivers at what a camera sees, with the picture they belong to; `texture` (P, 3) is the texture's colour.
+
+    `points` holds the P receivers of pixels, and after them those of the vertices, if light bounces off these.
+    """
 
     points: Receivers
     pixel: NDArray[np.int32]
@@ -56,8 +65,18 @@ def check_receivers(asked: str, scene: Scene, geometry: Geometry, both: NDArray[
 def make_receivers(asked: str, scene: Scene, geometry: Geometry, both: NDArray[np.bool_]) -> Receivers | PixelReceivers:
     """The receivers that `--receivers` asks for, once checked. `both` (O,): objects lit from both sides."""
     if asked == "vertices":
-        return vertex_receivers(geometry.positions, geometry.normals, geometry.faces, geometry.vertex_object, both)
+        return on_vertices(geometry, both)
     return _pixel_receivers(scene, asked.partition(":")[2], geometry)
+
+
+def on_vertices(geometry: Geometry, both: NDArray[np.bool_]) -> Receivers:
+    """The receivers of the mesh's vertices. `both` (O,): objects lit from both sides."""
+    return vertex_receivers(geometry.positions, geometry.normals, geometry.faces, geometry.vertex_object, both)
+
+
+def with_vertices(pixels: PixelReceivers, vertices: Receivers) -> PixelReceivers:
+    """Pixels' receivers, followed by the vertices that light reaches them from."""
+    return replace(pixels, points=join_receivers(pixels.points, vertices))
 
 
 def _pixel_receivers(scene: Scene, name: str, geometry: Geometry) -> PixelReceivers:
@@ -129,7 +148,7 @@ def put_vertex_colours(writer: formats.Writer, geometry: Geometry) -> None:
 def put_receivers(
     writer: formats.Writer, receivers: Receivers | PixelReceivers, buried: NDArray[np.bool_] | None
 ) -> None:
-    """`buried` (N,) belongs to vertex receivers."""
+    """`buried` (N,), where there are receivers on vertices."""
     points = receivers.points if isinstance(receivers, PixelReceivers) else receivers
     put = writer.put
     put("receivers/position", points.position, dims=("receiver", "axis"), units="m")
@@ -137,11 +156,12 @@ def put_receivers(
     put("receivers/object", points.object, dims=("receiver",))
     put("receivers/side", points.side, dims=("receiver",))
     if isinstance(receivers, PixelReceivers):
-        put("receivers/pixel", receivers.pixel, dims=("receiver",))
-        put("receivers/weight", receivers.weight, dims=("receiver",))
-        put("receivers/view", receivers.view, dims=("receiver", "axis"))
-        put("receivers/texture", receivers.texture, dims=("receiver", "colour"))
+        dim = "receiver" if buried is None else "pixel_receiver"  # the first of all receivers
+        put("receivers/pixel", receivers.pixel, dims=(dim,))
+        put("receivers/weight", receivers.weight, dims=(dim,))
+        put("receivers/view", receivers.view, dims=(dim, "axis"))
+        put("receivers/texture", receivers.texture, dims=(dim, "colour"))
         put("picture/coverage", receivers.coverage, dims=("row", "column"))
-    else:
+    if buried is not None:
         put("receivers/vertex", points.vertex, dims=("receiver",))
         put("receivers/buried", buried, dims=("receiver",))
