@@ -48,15 +48,15 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def vertices(scene):
-    return make_store(scene, "vertices.zarr", bounces=2)
+    return make_store(scene, "vertices.zarr", bounces=2, light_resolution=32)
 
 
 @pytest.fixture(scope="module")
 def pixels(scene):
-    return make_store(scene, "pixels.zarr", bounces=2, receivers=PIXELS)
+    return make_store(scene, "pixels.zarr", bounces=2, light_resolution=32, receivers=PIXELS)
 
 
-@pytest.mark.parametrize("edit", [(), EDIT], ids=["as it is", "edited"])
+@pytest.mark.parametrize("edit", [pytest.param((), marks=pytest.mark.slow), EDIT], ids=["as it is", "edited"])
 def test_layers_against_vertices_and_the_path_tracer(vertices, pixels, edit):
     a = layers_of(pixels, "a.exr", settings=edit)
     b = layers_of(vertices, "b.exr", settings=edit)
@@ -117,7 +117,8 @@ def test_in_parts_and_in_frames(pixels, tmp_path, monkeypatch):
     # The same picture whether pixels are gathered at once, in parts, or in parts that are not kept; frame after frame.
     shots = tmp_path / "shots.toml"
     shots.write_text(
-        "format = 1\nframes = 2\n[[key]]\nframe = 1\nenv = 'smooth'\nenv_rotate = 0\n[[key]]\nframe = 2\nenv_rotate = 90\n"
+        "format = 1\nframes = 2\n[[key]]\nframe = 1\nenv = 'smooth'\nenv_rotate = 0\n"
+        "[[key]]\nframe = 2\nenv_rotate = 90\n"
     )
 
     def frames(name):
@@ -184,7 +185,8 @@ def test_same_bytes_however_it_was_made(scene, tmp_path, monkeypatch):
 
 
 def test_dry_run_counts_both(scene, pixels, tmp_path):
-    dry = precompute(Config(scene=scene, output=tmp_path / "t.zarr", receivers=PIXELS, bounces=2, dry_run=True))
+    asked = {"receivers": PIXELS, "bounces": 2, "light_resolution": 32}
+    dry = precompute(Config(scene=scene, output=tmp_path / "t.zarr", dry_run=True, **asked))
     assert not list(tmp_path.iterdir())
     store = formats.open_store(pixels)
     assert dry["receivers"] == store.array("receivers/side").shape[0]
