@@ -225,7 +225,8 @@ def _receivers(
 
     Pixels look at the uncut `source`, so that their direct light is the same with and without interreflections.
     """
-    asked = make_receivers(config.receivers, scene, geometry if config.receivers == "vertices" else source, both)
+    seen = geometry if config.receivers == "vertices" else source
+    asked = make_receivers(config.receivers, scene, seen, both, fine=bounces)
     if isinstance(asked, PixelReceivers) and not bounces:
         return asked, None
     vertices = on_vertices(geometry, both) if isinstance(asked, PixelReceivers) else asked

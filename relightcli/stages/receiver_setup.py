@@ -62,11 +62,14 @@ def check_receivers(asked: str, scene: Scene, geometry: Geometry, both: NDArray[
         )
 
 
-def make_receivers(asked: str, scene: Scene, geometry: Geometry, both: NDArray[np.bool_]) -> Receivers | PixelReceivers:
-    """The receivers that `--receivers` asks for, once checked. `both` (O,): objects lit from both sides."""
+def make_receivers(
+    asked: str, scene: Scene, geometry: Geometry, both: NDArray[np.bool_], fine: bool = False
+) -> Receivers | PixelReceivers:
+    """The receivers that `--receivers` asks for, once checked. `both` (O,): objects lit from both sides; fine: outlines
+    and textures of pixels as finely as vertices have them."""
     if asked == "vertices":
         return on_vertices(geometry, both)
-    return _pixel_receivers(scene, asked.partition(":")[2], geometry)
+    return _pixel_receivers(scene, asked.partition(":")[2], geometry, fine)
 
 
 def on_vertices(geometry: Geometry, both: NDArray[np.bool_]) -> Receivers:
@@ -79,7 +82,7 @@ def with_vertices(pixels: PixelReceivers, vertices: Receivers) -> PixelReceivers
     return replace(pixels, points=join_receivers(pixels.points, vertices))
 
 
-def _pixel_receivers(scene: Scene, name: str, geometry: Geometry) -> PixelReceivers:
+def _pixel_receivers(scene: Scene, name: str, geometry: Geometry, fine: bool) -> PixelReceivers:
     film = make_film(scene.cameras[name])
     tracer = Tracer(geometry.positions, geometry.faces)
     normals = primary.face_normals(geometry.positions, geometry.faces)
@@ -97,14 +100,14 @@ def _pixel_receivers(scene: Scene, name: str, geometry: Geometry) -> PixelReceiv
         np.full(len(sample), -1, np.int32),
         np.where(facing, 1, -1).astype(np.int8),
     )
-    return PixelReceivers(
-        points,
-        samples.pixel[sample],
-        samples.weight[sample],
-        seen.viewer[order].astype(np.float32),
-        seen.albedo[order].astype(np.float32),
-        samples.coverage,
-    )
+    pixel, weight, texture = samples.pixel[sample], samples.weight[sample], seen.albedo[order].astype(np.float32)
+    if fine:
+        base = primary.TEXTURE_GRID if geometry.textures else primary.BASE_GRID
+        samples = primary.see(tracer, film, geometry.face_object, normals, base)
+        finer = picture.lit_surface(geometry, samples)
+        of_sample = geometry.face_object[samples.face]
+        weight, texture = picture.share_out(samples, finer, of_sample, pixel, position, points.object, texture)
+    return PixelReceivers(points, pixel, weight, seen.viewer[order].astype(np.float32), texture, samples.coverage)
 
 
 def surfaces_of(geometry: Geometry, points: Receivers, buried: NDArray[np.bool_]) -> Surfaces:
