@@ -223,7 +223,7 @@ def _receivers(
 ) -> tuple[Receivers | PixelReceivers, NDArray[np.bool_] | None]:
     """The receivers, and which of them are buried, (N,), where there are any on vertices.
 
-    Pixels look at the uncut `source`, so that their direct light is the same with and without interreflections.
+    Pixels look at the uncut `source`: they are the same, and lit the same, with and without interreflections.
     """
     seen = geometry if config.receivers == "vertices" else source
     asked = make_receivers(config.receivers, scene, seen, both, fine=bounces)
