@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from relightcli.core.shade.gather import Gather
 
 IN_MEMORY = 1 << 30  # visibility up to this size stays in memory between frames
+ENTRIES = 1 << 23  # of pixels' gathers that are made at a time
 KINDS = ("transfer", "clusters", "asset")
 BLACK = (0.0, 0.0, 0.0)
 
@@ -106,7 +107,10 @@ class LightingStore:
         self.resolution = int(self.store.settings["light_resolution"])
         self.basis: str = self.store.settings["basis"]
         self.bounces = int(self.store.settings["bounces"])
-        self._gathered: Gather | None = None
+        # Receivers of pixels, which come first; those on vertices, if any, follow.
+        self.pixels = self.store.layouts["receivers/pixel"].shape[0] if "receivers/pixel" in self.store else 0
+        self._gathered: dict[int, Gather] = {}
+        self._seen: list[tuple[int, Gather]] | None = None
         self._bits: NDArray[np.uint8] | None = None
         layout = self.store.layouts["visibility/bits"]
         if layout.raw_bytes <= IN_MEMORY:
@@ -124,7 +128,7 @@ class LightingStore:
 
     def receiver_of_vertex(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Receiver on the front and on the back of every vertex, (V,) int32 each, -1 where there is none."""
-        if self.vertex is None:
+        if self.vertex is None or self.camera_name is not None:
             raise StoreError(
                 f"{self.store.path}: its receivers are pixels of camera {self.camera_name!r}, not vertices"
             )
@@ -136,14 +140,16 @@ class LightingStore:
         buried: NDArray[np.bool_] = found
         return buried
 
-    def blocks(self) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
-        """Visibility bits in ranges of receivers: all at once if they are in memory, else chunk by chunk."""
+    def blocks(self, first: int = 0, last: int | None = None) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
+        """Visibility bits in ranges of the receivers from `first` to `last`: all at once if they are in memory, else
+        chunk by chunk."""
+        last = len(self) if last is None else last
         if self._bits is not None:
-            yield slice(0, len(self)), self._bits
+            yield slice(first, last), self._bits[first:last]
             return
         array: Any = self.store.array("visibility/bits")
-        for start in range(0, len(self), self._chunk):
-            rows = slice(start, min(start + self._chunk, len(self)))
+        for start in range(first - first % self._chunk, last, self._chunk):
+            rows = slice(max(start, first), min(start + self._chunk, last))
             yield rows, np.asarray(array[rows])
 
     def bits_of(self, receivers: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
@@ -175,7 +181,7 @@ class LightingStore:
         coats = self._coats(list(materials.values()))
         if coats.shiny.any() and view is None:
             raise InputError("a material with a specular lobe looks different from everywhere: a --camera is needed")
-        gather = self.gather() if bounces else None
+        gather = self.gather(self.pixels) if bounces else None
         lit = active if gather is None else None
         direct = self._direct(environment, rotate, coats, view, active, lit, basis or self.basis)
         if gather is None:
@@ -287,22 +293,23 @@ class LightingStore:
 
         table = widen(coats.table, 0.5 * np.pi / gather.cells)
         factors = lobe_factors(table)
-        row = lobe_rows(coats.material, factors)
-        lobe = np.zeros((int(row.max()) + 1, 6, TERMS), np.float32)
+        first = self.pixels  # light comes from the receivers after these only, so that only they need room for lobes
+        row = np.roll(lobe_rows(np.roll(coats.material, -first), factors), first)
+        lobe = np.zeros((int(row[first:].max()) + 1, 6, TERMS), np.float32)
         if len(lobe):
             sky = splat(latlong_to_cube(environment, gather.cells, rotate))
-            for block, bits in self.blocks():
+            for block, bits in self.blocks(first):
                 sky_lobes(bits, self.normal[block], coats.material[block], factors, sky, lobe, row[block], self.threads)
             if "lights/bits" in self.store:
                 local_lobes(
-                    self.store.read("lights/bits"),
+                    self.store.read("lights/bits")[first:],
                     pack_lights(self.scene.lights.values()),
-                    self.position,
-                    self.normal,
-                    coats.material,
+                    self.position[first:],
+                    self.normal[first:],
+                    coats.material[first:],
                     factors,
                     lobe,
-                    row,
+                    row[first:],
                     self.threads,
                 )
         tint = self.tint()
@@ -310,44 +317,76 @@ class LightingStore:
         mask = np.ones(len(self), bool) if active is None else active
         if coats.partner is not None:
             mask = mask | mask[coats.partner]
+
+        def send(who: Gather, at: int, light: Exit, go_on: bool) -> tuple[NDArray[np.float32], ...]:
+            material, threads = coats.material, self.threads
+            return bounce(who, light, self.normal, material, table, factors, view, mask, go_on, threads, at)
+
+        lights: list[Exit] = []
+        arrived = []
         for number in range(1, bounces + 1):
             light = Exit(diffuse if tint is None else diffuse * tint, lobe, row)
-            e, specular, lobe = bounce(
-                gather,
-                light,
-                self.normal,
-                coats.material,
-                table,
-                factors,
-                view,
-                mask,
-                number < bounces,
-                self.threads,
-            )
+            e, specular, lobe = send(gather, first, light, number < bounces)
             diffuse = coats.diffuse(e)
-            yield Radiance(diffuse, specular if coats.shiny.any() else None)
+            if first:
+                lights.append(light)
+                arrived.append((e, specular))
+            else:
+                yield Radiance(diffuse, specular if coats.shiny.any() else None)
+        for at, seen in self._pixel_gathers() if first else ():
+            rows = slice(at, at + len(seen.start) - 1)
+            for light, (e, specular) in zip(lights, arrived, strict=True):
+                more = send(seen, at, light, False)
+                e[rows], specular[rows] = more[0][rows], more[1][rows]
+        for e, specular in arrived:
+            yield Radiance(coats.diffuse(e), specular if coats.shiny.any() else None)
 
-    def gather(self) -> Gather | None:
-        """Who sees whom; None where nothing blocks anything. Raises StoreError if that was not simulated."""
+    def gather(self, first: int = 0) -> Gather | None:
+        """Who sees whom, of the receivers from `first` on; None where nothing blocks anything.
+
+        Raises StoreError if that was not simulated.
+        """
         if "bounce/hit" not in self.store:
             if self.store.attrs["nothing_blocks"]:
                 return None
             raise StoreError(
                 f"{self.store.path}: holds direct light only; precompute with --bounces 1 or more, or use --reference"
             )
-        if self._gathered is None:
-            from relightcli.core.shade.gather import build_gather, join
+        if first not in self._gathered:
+            from relightcli.core.shade.gather import join
 
-            hits: Any = self.store.array("bounce/hit")
             step = len(self) if self.store.layouts["bounce/hit"].raw_bytes <= IN_MEMORY else self._chunk
-            parts = []
-            for block, bits in self.blocks():
-                for start in range(block.start, block.stop, step):
-                    rows = slice(start, min(start + step, block.stop))
-                    seen = bits[start - block.start : rows.stop - block.start]
-                    parts.append(build_gather(np.asarray(hits[rows]), seen, self.normal[rows], self.threads))
-            self._gathered = join(parts)
-        return self._gathered
+            self._gathered[first] = join([part for _, part in self._gathers(first, len(self), step)])
+        return self._gathered[first]
+
+    def _gathers(self, first: int, last: int, step: int) -> Iterator[tuple[int, Gather]]:
+        """Who sees whom, of the receivers from `first` to `last`, at most `step` at a time; with each part's first."""
+        from relightcli.core.shade.gather import build_gather
+
+        hits: Any = self.store.array("bounce/hit")
+        for block, bits in self.blocks(first, last):
+            for start in range(block.start, block.stop, step):
+                rows = slice(start, min(start + step, block.stop))
+                seen = bits[start - block.start : rows.stop - block.start]
+                yield start, build_gather(np.asarray(hits[rows]), seen, self.normal[rows], self.threads)
+
+    def _pixel_gathers(self) -> Iterator[tuple[int, Gather]]:
+        """Whom the receivers of pixels see, part by part; kept for the next frame if that takes no more than
+        IN_MEMORY."""
+        if self._seen is not None:
+            yield from self._seen
+            return
+        cells = int(np.prod(self.store.layouts["bounce/hit"].shape[1:]))
+        kept, size = [], 0
+        for at, part in self._gathers(0, self.pixels, max(1, ENTRIES // cells)):
+            size += part.source.nbytes + part.cell.nbytes + part.cosine.nbytes + part.solid_angle.nbytes
+            if size <= IN_MEMORY:
+                kept.append((at, part))
+            else:
+                kept.clear()
+            yield at, part
+        if size <= IN_MEMORY:
+            self._seen = kept
 
     def tint(self) -> NDArray[np.float32] | None:
         """Colour of the texture at every receiver, (N, 3) float32; None without textures."""
@@ -356,6 +395,7 @@ class LightingStore:
         colours: Any = self.store.read("bounce/texture")
         assert self.vertex is not None
         tint: NDArray[np.float32] = colours[self.vertex]
+        tint[: self.pixels] = 1.0  # a pixel's own texture acts in the picture
         return tint
 
     def _irradiance(self, sky: SkyCube, active: NDArray[np.bool_] | None, basis: str) -> NDArray[np.float32]:
@@ -395,7 +435,7 @@ class LightingStore:
 
     def partner(self) -> NDArray[np.int64]:
         """The receiver on the other side of the same vertex, itself where there is none."""
-        if self.vertex is None:
+        if self.vertex is None or self.pixels:  # pixels come without translucent materials
             return np.arange(len(self))
         front, back = self.receiver_of_vertex()
         other = np.where(self.side > 0, back[self.vertex], front[self.vertex]).astype(np.int64)

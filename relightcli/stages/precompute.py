@@ -30,11 +30,13 @@ from relightcli.stages.receiver_setup import (
     PixelReceivers,
     check_receivers,
     make_receivers,
+    on_vertices,
     put_geometry,
     put_receivers,
     put_vertex_colours,
     surfaces_of,
     unburied,
+    with_vertices,
 )
 from relightcli.stages.visibility_job import VisibilityJob, block_size, create_outputs
 
@@ -95,10 +97,10 @@ def precompute(config: Config) -> dict[str, Any]:
     if "one-bounce" in simulated:
         bounce_cells = config.bounce_resolution or (8 if config.light_resolution % 16 else 16)
     source = geometry
-    if shadows and config.subdivide and config.receivers == "vertices":
+    if shadows and config.subdivide and (config.receivers == "vertices" or bounce_cells):
         geometry = _subdivided(geometry)
     if config.dry_run:
-        return _dry_run(config, scene, geometry, both, plan, shadows, bounce_cells)
+        return _dry_run(config, scene, source, geometry, both, plan, shadows, bounce_cells)
     settings = {
         "effects": simulated,
         "light_resolution": config.light_resolution,
@@ -127,7 +129,8 @@ def precompute(config: Config) -> dict[str, Any]:
         return {"store": str(config.output), "status": "up to date", "notes": list(geometry.notes)}
     with writer:
         resumed = bool(writer.done)
-        receivers = make_receivers(config.receivers, scene, geometry, both)
+        receivers, buried = _receivers(config, scene, source, geometry, both, shadows, bool(bounce_cells))
+        points = receivers.points if isinstance(receivers, PixelReceivers) else receivers
         writer.set_attrs(
             {
                 "scene": scene_to_json(scene, geometry),
@@ -138,11 +141,6 @@ def precompute(config: Config) -> dict[str, Any]:
         put_geometry(writer, geometry)
         if geometry is not source:
             writer.put("source/face", source.faces, dims=("face", "corner"))
-        buried = None
-        if isinstance(receivers, Receivers):
-            buried = np.zeros(len(receivers), bool)
-            if shadows:
-                receivers, buried = unburied(geometry, receivers)
         put_receivers(writer, receivers, buried)
         if bounce_cells and geometry.textures:
             put_vertex_colours(writer, geometry)
@@ -158,6 +156,7 @@ def precompute(config: Config) -> dict[str, Any]:
             config.seed,
             tuple(scene.lights.values()),
             bounce_cells,
+            int(np.count_nonzero(points.vertex < 0)),
         )
         create_outputs(writer, job, len(receivers))
         run.run_blocks(
@@ -196,8 +195,6 @@ def _check(config: Config) -> None:
 
 
 def _check_bounces(config: Config) -> None:
-    if config.receivers != "vertices":
-        raise InputError("--receivers pixels: interreflections need vertices to bounce off; use --receivers vertices")
     cells = config.bounce_resolution
     if cells is not None and (cells not in BOUNCE_RESOLUTIONS or config.light_resolution % cells):
         raise InputError(
@@ -213,6 +210,32 @@ def _subdivided(geometry: Geometry) -> Geometry:
         return geometry
     note = f"faces too large to carry shadows were cut: {more} more vertices (--no-subdivide keeps them whole)"
     return replace(finer, notes=(*geometry.notes, note))
+
+
+def _receivers(
+    config: Config,
+    scene: Scene,
+    source: Geometry,
+    geometry: Geometry,
+    both: NDArray[np.bool_],
+    shadows: bool,
+    bounces: bool,
+) -> tuple[Receivers | PixelReceivers, NDArray[np.bool_] | None]:
+    """The receivers, and which of them are buried, (N,), where there are any on vertices.
+
+    Pixels look at the uncut `source`: they are the same, and lit the same, with and without interreflections.
+    """
+    seen = geometry if config.receivers == "vertices" else source
+    asked = make_receivers(config.receivers, scene, seen, both, fine=bounces)
+    if isinstance(asked, PixelReceivers) and not bounces:
+        return asked, None
+    vertices = on_vertices(geometry, both) if isinstance(asked, PixelReceivers) else asked
+    buried = np.zeros(len(vertices), bool)
+    if shadows and not config.dry_run:
+        vertices, buried = unburied(geometry, vertices)
+    if isinstance(asked, PixelReceivers):
+        return with_vertices(asked, vertices), np.concatenate([np.zeros(len(asked), bool), buried])
+    return vertices, buried
 
 
 def _both_sides(scene: Scene, geometry: Geometry) -> NDArray[np.bool_]:
@@ -267,6 +290,7 @@ def _raw_bytes(geometry: Geometry, points: Receivers) -> int:
 def _dry_run(
     config: Config,
     scene: Scene,
+    source: Geometry,
     geometry: Geometry,
     both: NDArray[np.bool_],
     plan: list[effects.Decision],
@@ -277,7 +301,7 @@ def _dry_run(
 
     The bytes are an upper bound: the mesh counts uncompressed, and the pilot's bits compress worse in small groups.
     """
-    receivers = make_receivers(config.receivers, scene, geometry, both)
+    receivers, _ = _receivers(config, scene, source, geometry, both, shadows, bool(bounce_cells))
     points = receivers.points if isinstance(receivers, PixelReceivers) else receivers
     rays = seconds = packed = 0.0
     if shadows and len(points):

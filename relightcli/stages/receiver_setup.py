@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,13 @@ from relightcli.core.shade import picture, primary
 from relightcli.core.transport.buried import unbury
 from relightcli.core.transport.camera import make_film
 from relightcli.core.transport.hits import Surfaces
-from relightcli.core.transport.receivers import Receivers, receivers_of_vertices, spatial_order, vertex_receivers
+from relightcli.core.transport.receivers import (
+    Receivers,
+    join_receivers,
+    receivers_of_vertices,
+    spatial_order,
+    vertex_receivers,
+)
 from relightcli.core.transport.shading import vertex_colours
 from relightcli.errors import InputError
 from relightcli.scene.model import Geometry, Scene
@@ -23,7 +29,10 @@ PIXEL_GRIDS = (1, 3)  # samples along a pixel's side, inside and at edges, for p
 
 @dataclass(frozen=True)
 class PixelReceivers:
-    """Receivers at what a camera sees, with the picture they belong to; `texture` (N, 3) is the texture's colour."""
+    """Receivers at what a camera sees, with the picture they belong to; `texture` (P, 3) is the texture's colour.
+
+    `points` holds the P receivers of pixels, and after them those of the vertices, if light bounces off these.
+    """
 
     points: Receivers
     pixel: NDArray[np.int32]
@@ -53,14 +62,27 @@ def check_receivers(asked: str, scene: Scene, geometry: Geometry, both: NDArray[
         )
 
 
-def make_receivers(asked: str, scene: Scene, geometry: Geometry, both: NDArray[np.bool_]) -> Receivers | PixelReceivers:
-    """The receivers that `--receivers` asks for, once checked. `both` (O,): objects lit from both sides."""
+def make_receivers(
+    asked: str, scene: Scene, geometry: Geometry, both: NDArray[np.bool_], fine: bool = False
+) -> Receivers | PixelReceivers:
+    """The receivers that `--receivers` asks for, once checked. `both` (O,): objects lit from both sides; fine: outlines
+    and textures of pixels as finely as vertices have them."""
     if asked == "vertices":
-        return vertex_receivers(geometry.positions, geometry.normals, geometry.faces, geometry.vertex_object, both)
-    return _pixel_receivers(scene, asked.partition(":")[2], geometry)
+        return on_vertices(geometry, both)
+    return _pixel_receivers(scene, asked.partition(":")[2], geometry, fine)
 
 
-def _pixel_receivers(scene: Scene, name: str, geometry: Geometry) -> PixelReceivers:
+def on_vertices(geometry: Geometry, both: NDArray[np.bool_]) -> Receivers:
+    """The receivers of the mesh's vertices. `both` (O,): objects lit from both sides."""
+    return vertex_receivers(geometry.positions, geometry.normals, geometry.faces, geometry.vertex_object, both)
+
+
+def with_vertices(pixels: PixelReceivers, vertices: Receivers) -> PixelReceivers:
+    """Pixels' receivers, followed by the vertices that light reaches them from."""
+    return replace(pixels, points=join_receivers(pixels.points, vertices))
+
+
+def _pixel_receivers(scene: Scene, name: str, geometry: Geometry, fine: bool) -> PixelReceivers:
     film = make_film(scene.cameras[name])
     tracer = Tracer(geometry.positions, geometry.faces)
     normals = primary.face_normals(geometry.positions, geometry.faces)
@@ -78,14 +100,14 @@ def _pixel_receivers(scene: Scene, name: str, geometry: Geometry) -> PixelReceiv
         np.full(len(sample), -1, np.int32),
         np.where(facing, 1, -1).astype(np.int8),
     )
-    return PixelReceivers(
-        points,
-        samples.pixel[sample],
-        samples.weight[sample],
-        seen.viewer[order].astype(np.float32),
-        seen.albedo[order].astype(np.float32),
-        samples.coverage,
-    )
+    pixel, weight, texture = samples.pixel[sample], samples.weight[sample], seen.albedo[order].astype(np.float32)
+    if fine:
+        base = primary.TEXTURE_GRID if geometry.textures else primary.BASE_GRID
+        samples = primary.see(tracer, film, geometry.face_object, normals, base)
+        finer = picture.lit_surface(geometry, samples)
+        of_sample = geometry.face_object[samples.face]
+        weight, texture = picture.share_out(samples, finer, of_sample, pixel, position, points.object, texture)
+    return PixelReceivers(points, pixel, weight, seen.viewer[order].astype(np.float32), texture, samples.coverage)
 
 
 def surfaces_of(geometry: Geometry, points: Receivers, buried: NDArray[np.bool_]) -> Surfaces:
@@ -129,7 +151,7 @@ def put_vertex_colours(writer: formats.Writer, geometry: Geometry) -> None:
 def put_receivers(
     writer: formats.Writer, receivers: Receivers | PixelReceivers, buried: NDArray[np.bool_] | None
 ) -> None:
-    """`buried` (N,) belongs to vertex receivers."""
+    """`buried` (N,), where there are receivers on vertices."""
     points = receivers.points if isinstance(receivers, PixelReceivers) else receivers
     put = writer.put
     put("receivers/position", points.position, dims=("receiver", "axis"), units="m")
@@ -137,11 +159,12 @@ def put_receivers(
     put("receivers/object", points.object, dims=("receiver",))
     put("receivers/side", points.side, dims=("receiver",))
     if isinstance(receivers, PixelReceivers):
-        put("receivers/pixel", receivers.pixel, dims=("receiver",))
-        put("receivers/weight", receivers.weight, dims=("receiver",))
-        put("receivers/view", receivers.view, dims=("receiver", "axis"))
-        put("receivers/texture", receivers.texture, dims=("receiver", "colour"))
+        dim = "receiver" if buried is None else "pixel_receiver"  # the first of all receivers
+        put("receivers/pixel", receivers.pixel, dims=(dim,))
+        put("receivers/weight", receivers.weight, dims=(dim,))
+        put("receivers/view", receivers.view, dims=(dim, "axis"))
+        put("receivers/texture", receivers.texture, dims=(dim, "colour"))
         put("picture/coverage", receivers.coverage, dims=("row", "column"))
-    else:
+    if buried is not None:
         put("receivers/vertex", points.vertex, dims=("receiver",))
         put("receivers/buried", buried, dims=("receiver",))

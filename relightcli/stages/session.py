@@ -140,8 +140,10 @@ class Session:
             matrix = picture.sample_matrix(
                 read("receivers/pixel"), read("receivers/weight"), read("receivers/texture"), width * height
             )
-            active = np.ones(len(lighting), bool)
-            return _View(camera, matrix, read("picture/coverage"), active, read("receivers/view"))
+            towards = np.zeros((len(lighting), 3), np.float32)
+            towards[: lighting.pixels] = read("receivers/view")
+            active = np.arange(len(lighting)) < lighting.pixels
+            return _View(camera, matrix, read("picture/coverage"), active, towards)
         geometry = lighting.geometry
         if self._tracer is None:
             self._tracer = Tracer(geometry.positions, geometry.faces)

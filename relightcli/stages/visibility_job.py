@@ -38,6 +38,7 @@ class VisibilityJob:
     seed: int
     lights: tuple[SphereLight | RectangleLight, ...]
     bounce_cells: int  # cells along a side of the cube of what is seen; 0: no interreflections
+    pixels: int = 0  # receivers before the first that is on a vertex
 
     def open(self) -> VisibilityWorker:
         return VisibilityWorker(self)
@@ -66,17 +67,7 @@ class VisibilityWorker:
         if self.tracer is None:
             bits = visibility.horizon_bits(normal, job.resolution)
         else:
-            traced = visibility.trace_visibility(
-                self.tracer, position, normal, job.resolution, job.refine, job.seed + block.start
-            )
-            bits = traced.bits
-            info |= {
-                "rays": float(traced.rays),
-                "checked": float(traced.checked),
-                "wrong": float(traced.wrong),
-                "inferred": float(traced.inferred),
-                "bits": float(3 * job.resolution**2 * len(position)),
-            }
+            bits = self._trace(self.tracer, block.start, position, normal, info)
         if self.lights.number:
             self.out["lights/bits"][rows], rays = light_bits(self.tracer, self.lights, position, normal)
             info["rays"] += float(rays)
@@ -101,6 +92,26 @@ class VisibilityWorker:
         elif job.basis == "dense":
             self.out["direct/dense"][rows] = _dense(bits, normal, self.directions, self.solid_angle)
         return info
+
+    def _trace(
+        self, tracer: Tracer, first: int, position: NDArray[np.float64], normal: NDArray[np.float32], info: dict[str, float]
+    ) -> NDArray[np.uint8]:
+        """Visibility bits of the receivers from `first` on; pixels and vertices apart, as if they were alone."""
+        job = self.job
+        cut = min(max(job.pixels - first, 0), len(position))
+        bits = []
+        for rows in (slice(0, cut), slice(cut, len(position))):
+            if rows.start == rows.stop:
+                continue
+            seed = job.seed + first + rows.start
+            traced = visibility.trace_visibility(tracer, position[rows], normal[rows], job.resolution, job.refine, seed)
+            bits.append(traced.bits)
+            info["rays"] += float(traced.rays)
+            info["checked"] += float(traced.checked)
+            info["wrong"] += float(traced.wrong)
+            info["inferred"] += float(traced.inferred)
+            info["bits"] += float(3 * job.resolution**2 * len(traced.bits))
+        return bits[0] if len(bits) == 1 else np.concatenate(bits)
 
 
 def _surfaces(array: Any) -> Surfaces:

@@ -109,7 +109,6 @@ def test_meshes(here, refused, content, words):
         (("--bounces", "x"), ("--bounces", "'x' is not a valid integer")),
         (("--bounces", "1", "--effects", "direct,shadows"), ("--bounces 1", "--effects names no bounces")),
         (("--bounces", "1", "--bounce-resolution", "12"), ("--bounce-resolution", "8, 16 or 32", "found 12")),
-        (("--bounces", "1", "--receivers", "pixels:main"), ("--receivers pixels", "use --receivers vertices")),
         (("--workers", "0"), ("--workers", "0 is not in the range")),
         (("--workers", "100000"), ("--workers", "is not in the range")),
         (("--seed", "-1"), ("--seed", "-1 is not in the range")),

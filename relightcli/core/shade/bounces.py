@@ -50,12 +50,14 @@ def bounce(
     active: NDArray[np.bool_],
     go_on: bool,
     threads: int = 1,
+    first: int = 0,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """One interreflection of the exit radiance `light`.
+    """One interreflection of the exit radiance `light`, at the receivers from `first` on that `gather` is about.
 
     Returns the irradiance (N, 3) float32; the specular exit radiance towards `view` (N, 3) of the `active` receivers
     (N,), with its colour, (N, 3) float32; and, to `go_on`, what the light factors gather, (G, 6, K), else nothing of
-    it. Receivers that are not active are left out unless it goes on.
+    it. Receivers that are not active are left out unless it goes on. The lobe of `light` has places for all that light
+    comes from, and, to go on, for all that it reaches; of others the row need only not be negative if they shine.
     """
     n = len(normals)
     irradiance, specular = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
@@ -68,6 +70,7 @@ def bounce(
         _bounce(
             a,
             b,
+            first,
             gather,
             directions,
             light,
@@ -85,18 +88,19 @@ def bounce(
             lobe,
         )
 
-    in_parts(part, n, threads)
+    in_parts(part, len(gather.start) - 1, threads)
     return irradiance, specular, lobe
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _bounce(  # type: ignore[no-untyped-def]
-    first, last, gather, directions, light, normals, material, models, parameters, factors, views, active, looked_at,
-    go_on, irradiance, specular, lobe_out,
+    start, stop, first, gather, directions, light, normals, material, models, parameters, factors, views, active,
+    looked_at, go_on, irradiance, specular, lobe_out,
 ):  # fmt: skip
     row = light.row
     wave = np.empty((2, TERMS), np.float32)
-    for i in range(first, last):
+    for x in range(start, stop):
+        i = first + x
         if not (active[i] or go_on):
             continue
         m = material[i]
@@ -106,7 +110,7 @@ def _bounce(  # type: ignore[no-untyped-def]
         axes = axes_of(n)
         looked_at_front = shiny and looked_at[i] and dot(n, v) > 0.0
         er = eg = eb = sr = sg = sb = 0.0
-        for z in range(gather.start[i], gather.start[i + 1]):
+        for z in range(gather.start[x], gather.start[x + 1]):
             y = gather.source[z]
             r, g, b = light.diffuse[y, 0], light.diffuse[y, 1], light.diffuse[y, 2]
             c = gather.cell[z]

@@ -124,6 +124,55 @@ def sample_matrix(
     return PixelMatrix(start.astype(np.int64), order.astype(np.int32), weight[order], texture[order])
 
 
+def share_out(
+    samples: Samples,
+    seen: Surface,
+    object: NDArray[np.int32],
+    pixel: NDArray[np.int32],
+    position: NDArray[np.float64],
+    receiver_object: NDArray[np.int32],
+    texture: NDArray[np.float32],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Weight (N,) and mean texture (N, 3) of camera samples' receivers by finer `samples` of the same pixels.
+
+    seen: `lit_surface` of `samples`; object (S,) of what they see. Each speaks for the nearest receiver of its pixel on
+    the same object, or on any if there is none. pixel, receiver_object (N,), position, texture (N, 3) of the receivers,
+    in any order; who gets no sample keeps its texture at weight 0.
+    """
+    order = np.argsort(pixel, kind="stable")
+    start = np.searchsorted(pixel[order], np.arange(samples.coverage.size + 1))
+    k = seen.path
+    total = np.zeros((len(pixel), 4))
+    _share_out(
+        samples.pixel[k], samples.weight[k], object[k], seen.position, seen.albedo,
+        start, order, position, receiver_object, total,
+    )  # fmt: skip
+    weight = total[:, 3]
+    mean = np.divide(total[:, :3], weight[:, None], out=texture.astype(np.float64), where=weight[:, None] > 0)
+    return weight.astype(np.float32), mean.astype(np.float32)
+
+
+@njit(cache=True)
+def _share_out(  # type: ignore[no-untyped-def]
+    pixel, weight, object, place, colour, start, order, position, receiver_object, total
+):
+    for s in range(len(pixel)):
+        best, least = -1, np.inf
+        for z in range(start[pixel[s]], start[pixel[s] + 1]):
+            r = order[z]
+            d = 0.0
+            for x in range(3):
+                d += (position[r, x] - place[s, x]) ** 2
+            if receiver_object[r] != object[s]:
+                d += 1e30
+            if d < least:
+                best, least = r, d
+        if best >= 0:
+            for x in range(3):
+                total[best, x] += weight[s] * colour[s, x]
+            total[best, 3] += weight[s]
+
+
 def assemble(
     matrix: PixelMatrix,
     diffuse: NDArray[np.float32],

@@ -54,12 +54,26 @@ def vertex_receivers(
 def receivers_of_vertices(
     vertex: NDArray[np.int32], side: NDArray[np.int8], count: int
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Receiver on the front and on the back of every one of `count` vertices, int32, -1 where there is none."""
+    """Receiver on the front and on the back of every one of `count` vertices, int32, -1 where there is none.
+
+    vertex, side (N,) of the receivers; those whose vertex is -1 are left out.
+    """
     front, back = np.full(count, -1, np.int32), np.full(count, -1, np.int32)
-    index = np.arange(len(vertex), dtype=np.int32)
-    front[vertex[side > 0]] = index[side > 0]
-    back[vertex[side < 0]] = index[side < 0]
+    for out, there in ((front, side > 0), (back, side < 0)):
+        index = np.flatnonzero(there & (vertex >= 0))
+        out[vertex[index]] = index
     return front, back
+
+
+def join_receivers(one: Receivers, two: Receivers) -> Receivers:
+    """The receivers of `one`, then those of `two`."""
+    return Receivers(
+        np.concatenate([one.position, two.position]),
+        np.concatenate([one.normal, two.normal]),
+        np.concatenate([one.object, two.object]),
+        np.concatenate([one.vertex, two.vertex]),
+        np.concatenate([one.side, two.side]),
+    )
 
 
 def spatial_order(positions: NDArray[np.float64], side: NDArray[np.int8] | None = None) -> NDArray[np.intp]:
