@@ -69,7 +69,7 @@ def layers_of(store, name, **settings):
 def test_pictures_of_the_asset_beside_those_of_the_transfer_store(transfer, asset, edit, env):
     # Measured: picture 0.5 to 0.8 %, one bounce 3 to 6 %, two bounces 9 to 26 % (a uniform value under coarse light).
     a = layers_of(transfer, "a.exr", settings=edit, env=env)
-    b = layers_of(asset, "b.exr", settings=edit, env=env)
+    b = layers_of(asset, "b.exr", settings=edit, env=env, basis="visibility")
     assert set(a) == set(b)
     np.testing.assert_array_equal(a["direct"], b["direct"])
     assert relative_rmse(b[""], a[""]) < 0.015
@@ -78,6 +78,15 @@ def test_pictures_of_the_asset_beside_those_of_the_transfer_store(transfer, asse
     np.testing.assert_allclose(b["two_bounce"].mean((0, 1)), a["two_bounce"].mean((0, 1)), rtol=0.2)
     parts = b["direct"] + b["one_bounce"] + b["two_bounce"]
     np.testing.assert_allclose(parts, b[""], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("edit", [(), EDIT], ids=["as it is", "edited"])
+def test_direct_light_from_tensors(transfer, asset, edit):
+    a = layers_of(transfer, "a.exr", settings=edit)["direct"]
+    b = layers_of(asset, "b.exr", settings=edit)["direct"]
+    print(relative_rmse(b, a), b.mean((0, 1)) / a.mean((0, 1)))
+    assert relative_rmse(b, a) < 0.05
+    np.testing.assert_allclose(b.mean((0, 1)), a.mean((0, 1)), rtol=0.02)
 
 
 def test_tensors_carry_the_energy_of_matte_surfaces(transfer):
