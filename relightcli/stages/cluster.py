@@ -136,6 +136,10 @@ def split_large(rows: NDArray[np.floating[Any]], label: NDArray[np.int32], most:
 
 
 def _need_bounces(lighting: LightingStore) -> None:
+    if lighting.camera_name is not None:
+        raise StoreError(
+            f"{lighting.store.path}: its receivers are pixels of a camera; precompute with --receivers vertices"
+        )
     if "bounce/hit" not in lighting.store:
         raise StoreError(
             f"{lighting.store.path}: holds direct light only, which needs no clusters; precompute with --bounces 1 or 2"
