@@ -87,7 +87,7 @@ def precompute(config: Config) -> dict[str, Any]:
         raise InputError(f"{scene.path}: {error}") from None
     geometry = build_geometry(scene)
     both = _both_sides(scene, geometry)
-    check_receivers(config.receivers, scene, geometry, both)
+    check_receivers(config.receivers, scene, geometry)
     if bounces:
         _check_bounces(config)
     plan = effects.decide(asked, geometry.positions, geometry.faces, bool(both.any()), _lobes(scene), bounces)

@@ -45,8 +45,8 @@ class PixelReceivers:
         return len(self.points)
 
 
-def check_receivers(asked: str, scene: Scene, geometry: Geometry, both: NDArray[np.bool_]) -> None:
-    """Refuse what `make_receivers` cannot make. Same parameters. Raises InputError."""
+def check_receivers(asked: str, scene: Scene, geometry: Geometry) -> None:
+    """Refuse what `make_receivers` cannot make. Raises InputError."""
     if asked == "vertices":
         return
     kind, _, name = asked.partition(":")
@@ -55,7 +55,8 @@ def check_receivers(asked: str, scene: Scene, geometry: Geometry, both: NDArray[
     if name not in scene.cameras:
         known = ", ".join(scene.cameras) or "none"
         raise InputError(f"--receivers: {scene.path} has no camera {name!r}; it has: {known}")
-    if (both & ~geometry.two_sided).any():
+    materials = list(scene.materials.values())
+    if any(materials[m].model == "translucent" for m in geometry.material):
         raise InputError(
             "--receivers pixels: translucent materials need light from the side that the camera does not see; "
             "use --receivers vertices"
@@ -101,13 +102,16 @@ def _pixel_receivers(scene: Scene, name: str, geometry: Geometry, fine: bool) ->
         np.where(facing, 1, -1).astype(np.int8),
     )
     pixel, weight, texture = samples.pixel[sample], samples.weight[sample], seen.albedo[order].astype(np.float32)
+    coverage = samples.coverage
     if fine:
         base = primary.TEXTURE_GRID if geometry.textures else primary.BASE_GRID
         samples = primary.see(tracer, film, geometry.face_object, normals, base)
         finer = picture.lit_surface(geometry, samples)
         of_sample = geometry.face_object[samples.face]
-        weight, texture = picture.share_out(samples, finer, of_sample, pixel, position, points.object, texture)
-    return PixelReceivers(points, pixel, weight, seen.viewer[order].astype(np.float32), texture, samples.coverage)
+        weight, texture, coverage = picture.share_out(
+            samples, finer, of_sample, pixel, position, points.object, texture
+        )
+    return PixelReceivers(points, pixel, weight, seen.viewer[order].astype(np.float32), texture, coverage)
 
 
 def surfaces_of(geometry: Geometry, points: Receivers, buried: NDArray[np.bool_]) -> Surfaces:

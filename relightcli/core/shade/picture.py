@@ -132,8 +132,9 @@ def share_out(
     position: NDArray[np.float64],
     receiver_object: NDArray[np.int32],
     texture: NDArray[np.float32],
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Weight (N,) and mean texture (N, 3) of camera samples' receivers by finer `samples` of the same pixels.
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Weight (N,) and mean texture (N, 3) of camera samples' receivers by finer `samples` of the same pixels, and their
+    coverage (H, W) without those whose pixel has no receiver.
 
     seen: `lit_surface` of `samples`; object (S,) of what they see. Each speaks for the nearest receiver of its pixel on
     the same object, or on any if there is none. pixel, receiver_object (N,), position, texture (N, 3) of the receivers,
@@ -142,19 +143,20 @@ def share_out(
     order = np.argsort(pixel, kind="stable")
     start = np.searchsorted(pixel[order], np.arange(samples.coverage.size + 1))
     k = seen.path
-    total = np.zeros((len(pixel), 4))
+    total, lost = np.zeros((len(pixel), 4)), np.zeros(samples.coverage.size)
     _share_out(
         samples.pixel[k], samples.weight[k], object[k], seen.position, seen.albedo,
-        start, order, position, receiver_object, total,
+        start, order, position, receiver_object, total, lost,
     )  # fmt: skip
     weight = total[:, 3]
     mean = np.divide(total[:, :3], weight[:, None], out=texture.astype(np.float64), where=weight[:, None] > 0)
-    return weight.astype(np.float32), mean.astype(np.float32)
+    coverage = np.maximum(samples.coverage - lost.reshape(samples.coverage.shape), 0.0)
+    return weight.astype(np.float32), mean.astype(np.float32), coverage.astype(np.float32)
 
 
 @njit(cache=True)
 def _share_out(  # type: ignore[no-untyped-def]
-    pixel, weight, object, place, colour, start, order, position, receiver_object, total
+    pixel, weight, object, place, colour, start, order, position, receiver_object, total, lost
 ):
     for s in range(len(pixel)):
         best, least = -1, np.inf
@@ -171,6 +173,8 @@ def _share_out(  # type: ignore[no-untyped-def]
             for x in range(3):
                 total[best, x] += weight[s] * colour[s, x]
             total[best, 3] += weight[s]
+        else:
+            lost[pixel[s]] += weight[s]
 
 
 def assemble(

@@ -29,6 +29,7 @@ def test_samples_go_to_the_nearest_receiver_of_their_object():
     none = np.zeros((n, 3))
     seen = Surface(at, none, none, none, colour, none, np.zeros(n, np.int32), np.arange(n))
     own = np.full((4, 3), 0.5, np.float32)
-    weight, texture = share_out(samples, seen, of_sample, pixel, position, objects, own)
+    weight, texture, coverage = share_out(samples, seen, of_sample, pixel, position, objects, own)
     np.testing.assert_allclose(weight, [1, 0.75, 0, 0.25])
     np.testing.assert_allclose(texture[:, 0], [0.8, (0.25 * 0.2 + 0.5 * 0.6) / 0.75, 0.5, 0.3], rtol=1e-6)
+    np.testing.assert_allclose(coverage, [[1, 1, 0]])
