@@ -104,7 +104,7 @@ ARRAYS: dict[str, tuple[str, ...]] = {
 
 class LightFactors(NamedTuple):
     """table (D, D, K+1) float32, sr^-1: light factors over the D x D grid of the disc [column of x, row of y], cells
-    beyond the rim filled with the nearest one; the last is 1/pi. importance (K+1,) float32: g, the root mean square of
+    beyond the rim filled from their neighbours; the last is 1/pi. importance (K+1,) float32: g, the root mean square of
     the view factors that belong to them, over settings whose BRDF has the norm 1, as the diffuse 1/pi has."""
 
     table: NDArray[np.float32]
@@ -245,38 +245,48 @@ def _is_grid(points: NDArray[np.float64]) -> bool:
 def setting(model: DirectModel, *values: float) -> MaterialSetting:
     """Run-time table of one material: setting(model, f0, roughness) or setting(model, shininess). [Sun 2007, Eq. 3]"""
     found = mix(model, *values)
-    weights, grid = found.weights, disc_grid(model.resolution)
-    tensor = np.tensordot(weights @ model.reflectance, model.core, 1)
-    at_cells = np.concatenate([model.view @ tensor, (weights @ model.cell_albedo)[:, None]], axis=1)
+    view = _view_nodes()
+    table = np.zeros((len(view), model.light.shape[1] + 1))
+    energy = np.zeros((POLAR, len(model.degrees)))
+    for entry in np.flatnonzero(found.weights):
+        of_table, of_energy = _entry(model, int(entry), view)
+        table += found.weights[entry] * of_table
+        energy += found.weights[entry] * of_energy
+    table = table.reshape(VIEW_SIDE, VIEW_SIDE, -1)
+    return MaterialSetting(table.astype(np.float32), energy.astype(np.float32), found.outside)
+
+
+def _entry(
+    model: DirectModel, entry: int, view: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """W (m, K+1) at the views (m, 3), and lobe energies (POLAR, L), of one entry: with its albedo."""
+    grid = disc_grid(model.resolution)
     cosine = np.linspace(0.0, 1.0, POLAR)
-    albedo = weights @ model.albedo
-    share = np.stack([lobe_share(degrees, cosine) for degrees in model.degrees], 1) if len(model.degrees) else None
+    sine = np.sqrt(1.0 - cosine**2)
+    albedo, cell_albedo = model.albedo[entry], model.cell_albedo[entry]
 
     # Lobes: their nodes are rings of cells.
-    ring = np.rint((grid.position**2).sum(1) * grid.resolution**2)
-    rings, inverse = np.unique(ring, return_inverse=True)
-    ring_albedo = np.bincount(inverse, at_cells[:, -1]) / np.bincount(inverse)
-    sine = np.sqrt(1.0 - cosine**2)
-    mean_albedo = np.interp(sine, np.sqrt(rings) / grid.resolution, ring_albedo)
-    scale = np.divide(albedo, mean_albedo, out=np.ones(POLAR), where=mean_albedo > 0.0)
+    rings, of_cell = np.unique(np.rint((grid.position**2).sum(1) * grid.resolution**2), return_inverse=True)
+    ring_albedo = np.bincount(of_cell, cell_albedo) / np.bincount(of_cell)
+    scale = _ratio(albedo, np.interp(sine, np.sqrt(rings) / grid.resolution, ring_albedo))
     energy = np.zeros((POLAR, len(model.degrees)))
     of_lobes = np.zeros(POLAR)
-    for k in range(len(model.degrees)):
-        energy[:, k] = scale * np.interp(sine, model.radius, weights @ model.energy[:, :, k])
-        if share is not None:
-            of_lobes += share[:, k] * energy[:, k]
+    for k, degrees in enumerate(model.degrees):
+        energy[:, k] = scale * np.interp(sine, model.radius, model.energy[entry, :, k])
+        of_lobes += energy[:, k] * lobe_share(degrees, cosine)
 
     # The tensor's part, and the albedo that is missing.
-    view = _view_nodes()
     index, part = bilinear(grid, view)
-    at_nodes = np.einsum("nc,nck->nk", part, at_cells[index])
+    factors = model.view @ np.tensordot(model.reflectance[entry], model.core, 1)
     exact = np.interp(view[:, 2], cosine, albedo)
-    scale = np.divide(exact, at_nodes[:, -1], out=np.ones(len(view)), where=at_nodes[:, -1] > 0.0)
-    table = at_nodes[:, :-1] * scale[:, None]
-    of_tensor = table @ (model.light.sum(0) * grid.area)
-    missing = exact - np.interp(view[:, 2], cosine, of_lobes) - of_tensor
-    table = np.concatenate([table, missing[:, None]], axis=1).reshape(VIEW_SIDE, VIEW_SIDE, -1)
-    return MaterialSetting(table.astype(np.float32), energy.astype(np.float32), found.outside)
+    scale = _ratio(exact, (part * cell_albedo[index]).sum(1))
+    table = scale[:, None] * np.einsum("nc,nck->nk", part, factors[index])
+    missing = exact - np.interp(view[:, 2], cosine, of_lobes) - table @ (model.light.sum(0) * grid.area)
+    return np.concatenate([table, missing[:, None]], axis=1), energy
+
+
+def _ratio(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.divide(a, b, out=np.ones(len(a)), where=b > 0.0)
 
 
 def _view_nodes() -> NDArray[np.float64]:
@@ -290,4 +300,8 @@ def _view_nodes() -> NDArray[np.float64]:
 
 
 def _dense(grid: DiscGrid, cells: NDArray[np.float64]) -> NDArray[np.float32]:
-    return np.ascontiguousarray(cells[grid.lookup], np.float32)
+    """Values (n, K) at the cells of the whole square, (D, D, K) float32."""
+    axis = 2.0 * (np.arange(grid.resolution) + 0.5) / grid.resolution - 1.0
+    square = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1)
+    index, part = bilinear(grid, square)
+    return np.ascontiguousarray(np.einsum("xyc,xyck->xyk", part, cells[index]), np.float32)
