@@ -26,6 +26,7 @@ NAMES = (
     "accuracy",
     "interreflections",
     "brdf",
+    "direct",
 )
 PACKAGES = ("relightcli", "numpy", "numba", "zarr", "embreex", "mitsuba", "pyradiance")
 RESULTS = Path("build/bench.json")
