@@ -28,6 +28,7 @@ NAMES = (
     "brdf",
     "asset",
     "asset_growth",
+    "direct",
 )
 PACKAGES = ("relightcli", "numpy", "numba", "zarr", "embreex", "mitsuba", "pyradiance")
 RESULTS = Path("build/bench.json")

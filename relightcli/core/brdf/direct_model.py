@@ -26,10 +26,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from relightcli.core.brdf.albedo import directional_albedo, lobe_share
 from relightcli.core.brdf.dataset import BrdfSet, blinn_phong_set, cook_torrance_set
@@ -104,7 +106,7 @@ ARRAYS: dict[str, tuple[str, ...]] = {
 
 class LightFactors(NamedTuple):
     """table (D, D, K+1) float32, sr^-1: light factors over the D x D grid of the disc [column of x, row of y], cells
-    beyond the rim filled with the nearest one; the last is 1/pi. importance (K+1,) float32: g, the root mean square of
+    beyond the rim filled from their neighbours; the last is 1/pi. importance (K+1,) float32: g, the root mean square of
     the view factors that belong to them, over settings whose BRDF has the norm 1, as the diffuse 1/pi has."""
 
     table: NDArray[np.float32]
@@ -245,49 +247,79 @@ def _is_grid(points: NDArray[np.float64]) -> bool:
 def setting(model: DirectModel, *values: float) -> MaterialSetting:
     """Run-time table of one material: setting(model, f0, roughness) or setting(model, shininess). [Sun 2007, Eq. 3]"""
     found = mix(model, *values)
-    weights, grid = found.weights, disc_grid(model.resolution)
-    tensor = np.tensordot(weights @ model.reflectance, model.core, 1)
-    at_cells = np.concatenate([model.view @ tensor, (weights @ model.cell_albedo)[:, None]], axis=1)
-    cosine = np.linspace(0.0, 1.0, POLAR)
-    albedo = weights @ model.albedo
-    share = np.stack([lobe_share(degrees, cosine) for degrees in model.degrees], 1) if len(model.degrees) else None
-
-    # Lobes: their nodes are rings of cells.
-    ring = np.rint((grid.position**2).sum(1) * grid.resolution**2)
-    rings, inverse = np.unique(ring, return_inverse=True)
-    ring_albedo = np.bincount(inverse, at_cells[:, -1]) / np.bincount(inverse)
-    sine = np.sqrt(1.0 - cosine**2)
-    mean_albedo = np.interp(sine, np.sqrt(rings) / grid.resolution, ring_albedo)
-    scale = np.divide(albedo, mean_albedo, out=np.ones(POLAR), where=mean_albedo > 0.0)
+    table = np.zeros((VIEW_SIDE * VIEW_SIDE, model.light.shape[1] + 1))
     energy = np.zeros((POLAR, len(model.degrees)))
-    of_lobes = np.zeros(POLAR)
-    for k in range(len(model.degrees)):
-        energy[:, k] = scale * np.interp(sine, model.radius, weights @ model.energy[:, :, k])
-        if share is not None:
-            of_lobes += share[:, k] * energy[:, k]
-
-    # The tensor's part, and the albedo that is missing.
-    view = _view_nodes()
-    index, part = bilinear(grid, view)
-    at_nodes = np.einsum("nc,nck->nk", part, at_cells[index])
-    exact = np.interp(view[:, 2], cosine, albedo)
-    scale = np.divide(exact, at_nodes[:, -1], out=np.ones(len(view)), where=at_nodes[:, -1] > 0.0)
-    table = at_nodes[:, :-1] * scale[:, None]
-    of_tensor = table @ (model.light.sum(0) * grid.area)
-    missing = exact - np.interp(view[:, 2], cosine, of_lobes) - of_tensor
-    table = np.concatenate([table, missing[:, None]], axis=1).reshape(VIEW_SIDE, VIEW_SIDE, -1)
+    for entry in np.flatnonzero(found.weights):
+        of_table, of_energy = _entry(model, int(entry))
+        table += found.weights[entry] * of_table
+        energy += found.weights[entry] * of_energy
+    table = table.reshape(VIEW_SIDE, VIEW_SIDE, -1)
     return MaterialSetting(table.astype(np.float32), energy.astype(np.float32), found.outside)
 
 
-def _view_nodes() -> NDArray[np.float64]:
-    """Directions (S S, 3) of the nodes of a view table."""
+class _Nodes(NamedTuple):
+    """Where a view table is made. cosine (m,) of its nodes; to_node (m, n) sparse: bilinear from cells; sine (POLAR,);
+    to_ring (R, n) sparse: means of the cells at one theta_o; radius (R,), sin(theta_o) of theirs."""
+
+    cosine: NDArray[np.float64]
+    to_node: Any
+    sine: NDArray[np.float64]
+    to_ring: Any
+    radius: NDArray[np.float64]
+
+
+@lru_cache(maxsize=4)
+def _nodes(resolution: int) -> _Nodes:
+    grid = disc_grid(resolution)
     axis = np.linspace(-1.0, 1.0, VIEW_SIDE)
     p = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
     radius2 = (p**2).sum(1)
     p /= np.sqrt(np.maximum(radius2, 1.0))[:, None]
     z = np.maximum(1.0 - radius2, 0.0)
-    return np.concatenate([p * np.sqrt(1.0 + z)[:, None], z[:, None]], axis=1)
+    index, part = bilinear(grid, p * np.sqrt(1.0 + z)[:, None])
+    to_node = csr_array((part.reshape(-1), index.reshape(-1), 4 * np.arange(len(p) + 1)), (len(p), len(grid)))
+    rings, of_cell = np.unique(np.rint((grid.position**2).sum(1) * resolution**2), return_inverse=True)
+    weight = 1.0 / np.bincount(of_cell)[of_cell]
+    to_ring = csr_array((weight, (of_cell, np.arange(len(grid)))), (len(rings), len(grid)))
+    sine = np.sqrt(1.0 - np.linspace(0.0, 1.0, POLAR) ** 2)
+    return _Nodes(z, to_node, sine, to_ring, np.sqrt(rings) / resolution)
+
+
+@lru_cache(maxsize=32)
+def _share(degrees: float) -> NDArray[np.float64]:
+    return lobe_share(degrees, np.linspace(0.0, 1.0, POLAR))
+
+
+def _entry(model: DirectModel, entry: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """W (m, K+1) at the nodes of a view table, and lobe energies (POLAR, L), of one entry: with its albedo."""
+    nodes = _nodes(model.resolution)
+    cosine = np.linspace(0.0, 1.0, POLAR)
+    albedo, cell_albedo = model.albedo[entry], model.cell_albedo[entry]
+
+    # Lobes: their nodes are rings of cells.
+    scale = _ratio(albedo, np.interp(nodes.sine, nodes.radius, nodes.to_ring @ cell_albedo))
+    energy = np.zeros((POLAR, len(model.degrees)))
+    of_lobes = np.zeros(POLAR)
+    for k, degrees in enumerate(model.degrees):
+        energy[:, k] = scale * np.interp(nodes.sine, model.radius, model.energy[entry, :, k])
+        of_lobes += energy[:, k] * _share(float(degrees))
+
+    # The tensor's part, and the albedo that is missing.
+    factors = model.view @ np.tensordot(model.reflectance[entry], model.core, 1)
+    exact = np.interp(nodes.cosine, cosine, albedo)
+    table = _ratio(exact, nodes.to_node @ cell_albedo)[:, None] * (nodes.to_node @ factors)
+    factor_sum = model.light.sum(0) * disc_grid(model.resolution).area
+    missing = exact - np.interp(nodes.cosine, cosine, of_lobes) - table @ factor_sum
+    return np.concatenate([table, missing[:, None]], axis=1), energy
+
+
+def _ratio(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.divide(a, b, out=np.ones(len(a)), where=b > 0.0)
 
 
 def _dense(grid: DiscGrid, cells: NDArray[np.float64]) -> NDArray[np.float32]:
-    return np.ascontiguousarray(cells[grid.lookup], np.float32)
+    """Values (n, K) at the cells of the whole square, (D, D, K) float32."""
+    axis = 2.0 * (np.arange(grid.resolution) + 0.5) / grid.resolution - 1.0
+    square = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1)
+    index, part = bilinear(grid, square)
+    return np.ascontiguousarray(np.einsum("xyc,xyck->xyk", part, cells[index]), np.float32)
