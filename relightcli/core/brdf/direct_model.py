@@ -10,9 +10,9 @@ A deviation from the paper: the view factor W(w_o, K) of the diffuse light facto
 
     A(w_o) = integral of f cos(theta_i) dw_i
 
-exact for every view. Least squares with few factors loses energy, a third of it for roughness 0.2, and cells average A
-over views where it is steep; neither costs anything to put right. Lobes and W are scaled by A over its mean over the
-view's cell, and W(w_o, K) is what is then missing.
+exact for every view. Least squares with few factors loses energy, and cells average A over views where it is steep. Put
+right, at no cost at run time, the error under an overcast sky falls from 0.41 to 0.20 (roughness 0.2, f0 = 0.8).
+Lobes and W are scaled by A over its mean over the view's cell, and W(w_o, K) is what is then missing.
 
 Between the entries all of this is interpolated linearly (`navigation`). The default set of Cook-Torrance is a grid of
 roughness and of f0 in {0, 1}: Schlick's term F = F_0 + f0 (1 - F_0), F_0 = (1 - v.h)^5, is linear in f0, so that two
@@ -44,7 +44,7 @@ from relightcli.errors import InputError
 
 FAMILIES = ("cook-torrance", "blinn-phong")
 # n_h, n_o, n_i. The paper has 4 (Cook-Torrance) or 3 (Blinn-Phong), 8, 8. [Sun 2007, sec. 4.3] Only n_i counts at run
-# time, because a material's W is made when it is set; twice the other two take a quarter off the error.
+# time, because a material's W is made when it is set; twice the other two take a tenth to two fifths off the error.
 RANKS = {"cook-torrance": (8, 16, 8), "blinn-phong": (6, 16, 8)}
 # Changes whenever the same arguments give another model.
 VERSION = 1
@@ -151,7 +151,7 @@ def build_direct_model(
     resolution: int = RESOLUTION,
     weighted: bool = True,
 ) -> DirectModel:
-    """Samples, splits and factorises a set: 86 MB of memory for every 16 entries at 32 x 32 cells.
+    """Samples, splits and factorises a set. Takes about 0.2 GB of memory for every 16 entries at 32 x 32 cells.
 
     points: entries as of `default_points`, which is the default; ranks: n_h, n_o, n_i, cut down to what the set has,
     and n_o, n_i moved up by one where a pair would be cut; degrees: of the lobes; weighted: entries in units of their
@@ -175,7 +175,8 @@ def _factorise(
     norm[norm == 0.0] = 1.0
     unit = norm if weighted else np.full(len(norm), math.sqrt(float((norm**2).mean())))
     cell_albedo = brdfs.values.sum(2) * grid.area
-    remainder = brdfs.values - lobes_on_grid(grid, lobes)
+    remainder = brdfs.values  # from here on
+    remainder -= lobes_on_grid(grid, lobes)
     remainder -= remainder.mean(2, keepdims=True)
     remainder /= unit[:, None, None]
     # In two steps: the sweeps are then over a small tensor.

@@ -243,7 +243,7 @@ def test_scene_and_light_turn_together(model):
         here = radiance(model, setting, seen(NORMALS, blocked), NORMALS, VIEWS, pixels)
         bits = seen(turned_normals, turn @ blocked)
         there = radiance(model, setting, bits, turned_normals, turned_views, turned_pixels)
-            assert np.sqrt(((here - there) ** 2).mean()) < 0.075 * np.sqrt((here**2).mean())
+        assert np.sqrt(((here - there) ** 2).mean()) < 0.075 * np.sqrt((here**2).mean())
 
 
 def test_prefiltered_sky_keeps_energy():
@@ -269,7 +269,7 @@ def test_a_finer_sky_for_the_mirror():
 
 
 # A wall that covers half of the sphere: the share of a Gaussian about a direction at an angle a from it is the normal
-# distribution at a / sigma. 72 directions, and bilinear look-up in between nodes that are 1.75 sigma apart: measured 0.053.
+# distribution at a / sigma. 72 directions, and bilinear look-up between nodes 1.75 sigma apart: measured 0.053.
 @pytest.mark.parametrize("degrees", [7.0, 14.0, 21.0])
 def test_visible_share_beside_a_wall(degrees):
     normals = np.tile(np.float32([0.0, 1.0, 0.0]), (1, 1))
