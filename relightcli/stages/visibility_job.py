@@ -94,7 +94,12 @@ class VisibilityWorker:
         return info
 
     def _trace(
-        self, tracer: Tracer, first: int, position: NDArray[np.float64], normal: NDArray[np.float32], info: dict[str, float]
+        self,
+        tracer: Tracer,
+        first: int,
+        position: NDArray[np.float64],
+        normal: NDArray[np.float32],
+        info: dict[str, float],
     ) -> NDArray[np.uint8]:
         """Visibility bits of the receivers from `first` on; pixels and vertices apart, as if they were alone."""
         job = self.job
