@@ -17,19 +17,27 @@ from relightcli.stages import cluster, factorize
 from relightcli.stages.lighting import LightingStore
 from relightcli.stages.relight import Config, relight
 from relightcli.stages.transfer_setup import TransferSetup, coarse_cells
-from tests.core.transport.scenes import lambert, sphere, square
+from tests.core.transport.scenes import Part, lambert, sphere, square
+from tests.core.transport.test_buried import grid
 from tests.stages.scene_files import make_store, read_layers, write_scene
 from tests.stages.test_bounces import EDIT, GOLD, LAMP, corner
 
 CAMERA = Camera("main", (0.4, 1.3, 2.6), (0, 0.4, 0), fov=38, size=(64, 48))
+CLUSTERS = 12
 MATTE = ("gold.specular=0,0,0",)
+
+
+def ground(cells, material):
+    """A square of 3 x 3 in the xz plane that faces up, in cells."""
+    corners, triangles = grid((-1.5, 0, 1.5), (3, 0, 0), (0, 0, -3), cells)
+    return Part(corners, triangles, np.tile([0.0, 1.0, 0.0], (len(corners), 1)), material=material)
 
 
 @pytest.fixture(scope="module")
 def transfer(tmp_path_factory):
     tiles = np.kron(np.array([[0, 1], [1, 0]]), np.ones((4, 4)))[..., None] * [0.8, 0.3, 0.2] + 0.1
     parts = {
-        "ground": square(3, material=lambert((0.6, 0.5, 0.4))),
+        "ground": ground(24, lambert((0.6, 0.5, 0.4))),
         "wall": corner(lambert(1.0), tiles),
         "ball": sphere(0.4, (-0.5, 0.42, 0), rings=16, material=lambert((0.2, 0.5, 0.7))),
         "gold": sphere(0.35, (0.45, 0.36, 0.1), rings=16, material=GOLD),
@@ -39,13 +47,13 @@ def transfer(tmp_path_factory):
     maps = {"smooth": smooth, "patchy": np.kron(np.random.default_rng(0).random((8, 16, 3)) ** 3, np.ones((4, 4, 1)))}
     folder = tmp_path_factory.mktemp("scene")
     scene = write_scene(folder, parts, [CAMERA], maps, adjustable=True, more=LAMP)
-    return make_store(scene, workers=2, bounces=2, light_resolution=32, bounce_resolution=8)
+    return make_store(scene, workers=2, bounces=2, light_resolution=32, bounce_resolution=8, subdivide=False)
 
 
 @pytest.fixture(scope="module")
 def clusters(transfer):
     output = transfer.parent / "clusters.zarr"
-    said = cluster.cluster(cluster.Config(transfer, output, workers=2))
+    said = cluster.cluster(cluster.Config(transfer, output, CLUSTERS, workers=2))
     assert said["light_error"] < 0.03
     return output
 
@@ -84,7 +92,6 @@ def test_pictures_of_the_asset_beside_those_of_the_transfer_store(transfer, asse
 def test_direct_light_from_tensors(transfer, asset, edit):
     a = layers_of(transfer, "a.exr", settings=edit)["direct"]
     b = layers_of(asset, "b.exr", settings=edit)["direct"]
-    print(relative_rmse(b, a), b.mean((0, 1)) / a.mean((0, 1)))
     assert relative_rmse(b, a) < 0.05
     np.testing.assert_allclose(b.mean((0, 1)), a.mean((0, 1)), rtol=0.02)
 
@@ -149,7 +156,10 @@ def test_interrupted_work_is_continued_with_the_same_bytes(transfer, clusters, a
         (factorize.factorize, clusters, asset, ("one-bounce/0", "two-bounce/0")),
     ):
         output = tmp_path / made.name
-        config = (cluster.Config if stage is cluster.cluster else factorize.Config)(source, output, workers=1)
+        if stage is cluster.cluster:
+            config = cluster.Config(source, output, CLUSTERS, workers=1)
+        else:
+            config = factorize.Config(source, output, workers=1)
         for block in blocks:
 
             def interrupted(self, block_id, info, at=block):
