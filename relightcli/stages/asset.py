@@ -37,8 +37,8 @@ Factors = NDArray[np.float32]
 class AssetStore(LightingStore):
     """An open asset, with the interface of `LightingStore`."""
 
-    def __init__(self, path: Path, threads: int) -> None:
-        super().__init__(path, threads)
+    def __init__(self, store: Path | formats.Store, threads: int) -> None:
+        super().__init__(store, threads)
         settings = self.store.settings
         self.functions, self.order = int(settings["functions"]), int(settings["order"])
         self.second_order = int(settings["second_order"])

@@ -92,10 +92,12 @@ def read_scene(store: formats.Store) -> tuple[Scene, Geometry]:
 class LightingStore:
     """An open transfer store. Reads what it needs when it needs it; keeps small visibility in memory."""
 
-    def __init__(self, path: Path, threads: int) -> None:
-        self.store = formats.open_store(path)
+    def __init__(self, store: Path | formats.Store, threads: int) -> None:
+        self.store = formats.open_store(store) if isinstance(store, Path) else store
         if self.store.kind not in KINDS:
-            raise StoreError(f"{path}: expected a store of kind {' or '.join(KINDS)}, found {self.store.kind}.")
+            raise StoreError(
+                f"{self.store.path}: expected a store of kind {' or '.join(KINDS)}, found {self.store.kind}."
+            )
         self.threads = threads
         self.scene, self.geometry = read_scene(self.store)
         read: Any = self.store.read

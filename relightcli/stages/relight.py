@@ -53,11 +53,12 @@ def relight(config: Config) -> dict[str, Any]:
 
 def open_lighting(path: Path, threads: int) -> LightingStore:
     """The store of any stage that pictures are made from."""
-    if formats.open_store(path).kind != "asset":
-        return LightingStore(path, threads)
+    store = formats.open_store(path)
+    if store.kind != "asset":
+        return LightingStore(store, threads)
     from relightcli.stages.asset import AssetStore
 
-    return AssetStore(path, threads)
+    return AssetStore(store, threads)
 
 
 def _plan(config: Config, shots: list[Shot], lighting: LightingStore) -> dict[str, Any]:

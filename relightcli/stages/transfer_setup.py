@@ -13,7 +13,6 @@ from relightcli.core.sphere import cube
 from relightcli.core.transport.channels import light_factors, plan_channels, shiny_models
 from relightcli.core.transport.local_lights import pack_lights
 from relightcli.core.transport.transfer import (
-    SPECULAR,
     Sources,
     even_projection,
     gather_transfer,
@@ -181,6 +180,3 @@ class TransferSetup:
             if len(shiny):
                 factor[self.row[rows[shiny]]] = weights[self.model[rows[shiny]]] @ local[shiny]
         return Sources(even, factor, self.row, used, self.partner)
-
-    def has_lobes(self) -> bool:
-        return bool((self.channels.part >= SPECULAR).any() or self.exits.functions.any())
