@@ -15,15 +15,17 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterable, Mapping
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from queue import SimpleQueue
 from types import FrameType
 from typing import Any, Protocol
 
 from relightcli.errors import SystemFault
 
 RETRIES = 2  # new worker pools after one broke without finishing a single block
+PATIENCE = 5.0  # seconds that workers get to leave before they are killed
 Info = dict[str, float]
 
 
@@ -103,28 +105,44 @@ def run_blocks(
 
 
 def _drain(pool: Executor, job: Job, todo: list[Block], finish: Callable[[Block, Info], None]) -> list[Block]:
+    # A queue, not futures.wait: an interrupt amid its locks would leave one taken, and the pool waiting for it.
+    ended: SimpleQueue[Future[Info]] = SimpleQueue()
     try:
-        futures = _hand_in(pool, job, todo)
-        pending = set(futures)
-        while pending:
-            done, pending = wait(pending, return_when=FIRST_COMPLETED)
-            for future in done:
-                finish(futures[future], future.result())
+        futures = _hand_in(pool, job, todo, ended)
+        for _ in range(len(futures)):
+            future = ended.get()
+            finish(futures[future], future.result())
     except BaseException:
-        for process in list((getattr(pool, "_processes", None) or {}).values()):
-            process.terminate()
+        _end_workers(pool)
         pool.shutdown(wait=True, cancel_futures=True)
         raise
     return []
 
 
-def _hand_in(pool: Executor, job: Job, todo: list[Block]) -> Mapping[Future[Info], Block]:
+def _hand_in(
+    pool: Executor, job: Job, todo: list[Block], ended: SimpleQueue[Future[Info]]
+) -> Mapping[Future[Info], Block]:
     """Submits the blocks. Workers start meanwhile; an interrupt waits until they know that it is not theirs."""
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        return {pool.submit(_run, job, block): block for block in todo}
+        futures = {pool.submit(_run, job, block): block for block in todo}
+        for future in futures:
+            future.add_done_callback(ended.put)
+        return futures
     finally:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
+def _end_workers(pool: Executor) -> None:
+    """Asks the workers to leave, and kills those that have not left in time."""
+    processes = list((getattr(pool, "_processes", None) or {}).values())
+    for process in processes:
+        process.terminate()
+    deadline = time.monotonic() + PATIENCE
+    for process in processes:
+        process.join(max(0.0, deadline - time.monotonic()))
+        if process.exitcode is None:
+            process.kill()
 
 
 def _pool(workers: int) -> ProcessPoolExecutor:
