@@ -11,8 +11,10 @@ LARGEST: dict[str, int] = {"int8": 127, "uint8": 255, "int16": 32767}
 """Largest code of each type; signed codes are symmetric, -128 and -32768 are not used."""
 
 
-def quantise(values: Any, dtype: Code, *, axis: int | tuple[int, ...] = -1) -> tuple[NDArray[Any], NDArray[np.float32]]:
-    """Round to the nearest multiple of a scale: q = rint(v / s), s = max |v| / q_max over `axis`.
+def quantise(
+    values: Any, dtype: Code, *, axis: int | tuple[int, ...] = -1, least: float = 0.0
+) -> tuple[NDArray[Any], NDArray[np.float32]]:
+    """Round to the nearest multiple of a scale: q = rint(v / s), s = max(max |v| / q_max over `axis`, least).
 
     `axis=-1` gives one scale per row; all axes but the first give one per receiver; reshape to (blocks, rows, ...) for
     one per block. |v - q s| <= s / 2 holds exactly in real arithmetic.
@@ -21,6 +23,7 @@ def quantise(values: Any, dtype: Code, *, axis: int | tuple[int, ...] = -1) -> t
         values: real numbers, any shape with at least one axis; not negative for `uint8`.
         dtype: type of the codes.
         axis: the axes that share a scale.
+        least: no scale is smaller, but 0 of all-zero rows. What is small beside it becomes zeros, which compress well.
 
     Returns:
         codes, shape of `values`; scales, float32, the axes that share one kept with size 1. All-zero rows have scale 0.
@@ -47,6 +50,7 @@ def quantise(values: Any, dtype: Code, *, axis: int | tuple[int, ...] = -1) -> t
     scale = np.where(short, np.nextafter(scale, np.float32(np.inf)), scale)
     if not np.isfinite(scale).all():
         raise ValueError(f"quantise: {peak.max()} needs a scale beyond float32.")
+    scale = np.where(scale > 0, np.maximum(scale, np.float32(least)), scale)
     codes = np.rint(exact / np.where(scale > 0, scale, 1).astype(np.float64))
     return codes.astype(dtype), scale
 

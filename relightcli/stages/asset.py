@@ -1,7 +1,7 @@
 """An asset made ready to light: interreflections from compressed transfer tensors, kept by what has changed.
 
-    new light           light into every cluster's tensor; what follows
-    new materials       channels weighted and summed, clusters to receivers; what follows
+    new light           light into every cluster's tensor and every receiver's direct one; what follows
+    new materials       channels weighted and summed, clusters to receivers, diffuse light; what follows
     new view            specular lobes towards it
 
 [Sun 2007, sec. 4, Eq. 3-4]. Direct light comes from tensors too (`direct_tensors`), or with the basis visibility from
@@ -52,6 +52,8 @@ class AssetStore(LightingStore):
         self._direct_store: DirectTensors | None = None
         self._direct_sky: SkyCube | None = None
         self._lit: tuple[NDArray[np.float32], float, SkyCube] | None = None
+        self._coated: tuple[dict[str, Material], _Coats] | None = None
+        self._diffuse: dict[int, tuple[Factors, _Coats, Factors]] = {}
 
     def exit_radiance(
         self,
@@ -68,14 +70,7 @@ class AssetStore(LightingStore):
         bounces = self.bounces if bounces is None else bounces
         if bounces > self.bounces:
             raise InputError(f"--bounces {bounces}: the asset has {self.bounces}; use the transfer store it came from")
-        listed = list(materials.values())
-        for material, model in zip(listed, self.made_for, strict=True):
-            if material.model != model:
-                raise InputError(
-                    f"material {material.name}: is {material.model} now, and the asset was made for {model}; "
-                    "use the transfer store it came from"
-                )
-        coats = self._coats(listed)
+        coats = self._coats_of(materials)
         if basis is None:
             if coats.shiny.any() and view is None:
                 raise InputError("a material with a specular lobe looks different from everywhere: name a --camera")
@@ -92,10 +87,31 @@ class AssetStore(LightingStore):
         tensors.set_light(sky)
         tensors.set_materials(coefficients(self.channels, coats.table, self.functions))
         shines = bool(coats.shiny.any()) and view is not None
-        specular = self._specular(coats, view) if shines else [None] * len(tensors.even)
-        for even, lobes in zip(tensors.even[:bounces], specular[:bounces], strict=True):
-            parts.append(Radiance(coats.diffuse(even * np.float32(np.pi)), lobes))
+        specular = self._specular(coats, view, active) if shines else [None] * len(tensors.even)
+        for k, (even, lobes) in enumerate(zip(tensors.even[:bounces], specular[:bounces], strict=True)):
+            parts.append(Radiance(self._diffuse_of(k + 1, even, coats), lobes))
         return parts
+
+    def _coats_of(self, materials: dict[str, Material]) -> _Coats:
+        """The receivers' materials, kept while they stay the same."""
+        if self._coated is not None and self._coated[0] == materials:
+            return self._coated[1]
+        listed = list(materials.values())
+        for material, model in zip(listed, self.made_for, strict=True):
+            if material.model != model:
+                raise InputError(
+                    f"material {material.name}: is {material.model} now, and the asset was made for {model}; "
+                    "use the transfer store it came from"
+                )
+        self._coated = (materials, self._coats(listed))
+        return self._coated[1]
+
+    def _diffuse_of(self, part: int, even: Factors, coats: _Coats) -> Factors:
+        """Diffuse exit radiance of a part of the light from its irradiance over pi, kept while neither changes."""
+        kept = self._diffuse.get(part)
+        if kept is None or kept[0] is not even or kept[1] is not coats:
+            kept = self._diffuse[part] = (even, coats, coats.diffuse(even * np.float32(np.pi)))
+        return kept[2]
 
     def _sky_of(self, environment: NDArray[np.float32], rotate: float) -> SkyCube:
         if self._lit is None or self._lit[0] is not environment or self._lit[1] != rotate:
@@ -118,14 +134,14 @@ class AssetStore(LightingStore):
         if self._direct_sky is not sky:
             direct.set_light(sky)
             self._direct_sky = sky
-        e = direct.even * np.float32(np.pi)
         lamp_e, lamps = self._lamps(coats, view, active)
-        if lamp_e is not None:
-            e = e + lamp_e
-        diffuse = coats.diffuse(e)
+        if lamp_e is None:
+            diffuse = self._diffuse_of(0, direct.even, coats)
+        else:
+            diffuse = coats.diffuse(direct.even * np.float32(np.pi) + lamp_e)
         if not coats.shiny.any() or view is None:
             return Radiance(diffuse, None)
-        specular, known = direct.specular(coats.table, view)
+        specular, known = direct.specular(coats.table, view, active)
         rest = coats.shiny & ~known if active is None else coats.shiny & ~known & active
         if rest.any():
             specular += self._exact_specular(sky, environment, rotate, coats, view, np.flatnonzero(rest))
@@ -134,8 +150,10 @@ class AssetStore(LightingStore):
             specular += lamps * colours[coats.material]
         return Radiance(diffuse, specular)
 
-    def _specular(self, coats: _Coats, view: NDArray[np.float32] | None) -> list[NDArray[np.float32] | None]:
-        """Specular exit radiance after every bounce."""
+    def _specular(
+        self, coats: _Coats, view: NDArray[np.float32] | None, active: NDArray[np.bool_] | None
+    ) -> list[NDArray[np.float32] | None]:
+        """Specular exit radiance after every bounce, of `active` receivers; 0 of others."""
         assert self._tensors is not None
         assert view is not None
         tensors, table = self._tensors, coats.table
@@ -143,6 +161,7 @@ class AssetStore(LightingStore):
         tables = np.zeros((len(table.model), POLAR, self.order * (self.order + 1) // 2), np.float32)
         for m in np.flatnonzero(shiny):
             tables[m] = response(int(table.model[m]), table.parameters[m], self.order)
+        rows = np.arange(len(tensors.lobed)) if active is None else np.flatnonzero(active[tensors.lobed])
         colours = table.parameters[:, SPECULAR_COLUMN : SPECULAR_COLUMN + 3]
         colour = np.where(shiny[:, None], colours, 0.0).astype(np.float32)
         seen = view[tensors.lobed]
@@ -150,7 +169,7 @@ class AssetStore(LightingStore):
         found: list[NDArray[np.float32]] = []
         for k, local in enumerate(tensors.local):
             both = shade_low_order(
-                local, uniform, tensors.lobed_normal, seen, tables, colour, tensors.lobed_material, self.threads
+                rows, local, uniform, tensors.lobed_normal, seen, tables, colour, tensors.lobed_material, self.threads
             )
             found.append(both[0])
             if k == 0 and tensors.uniform is not None:

@@ -78,7 +78,7 @@ def put_direct(writer: formats.Writer, lighting: LightingStore, keep: int, threa
 
         index = array("index", (n, kept), "uint16" if texels <= 1 << 16 else "int32", ("coefficient",))
         scale = array("scale", (n, count), "float32", ("factor",))
-        value = array("value", (n, count, kept), "int8", ("factor", "coefficient"))
+        value = array("value", (n, kept, count), "int8", ("coefficient", "factor"))  # compresses better this way round
         wide = [d for d in degrees if d > 0.0]
         lobes = [
             array(f"lobe_{d:g}", (n, table_side(d), table_side(d)), "uint8", (f"row_{d:g}", f"column_{d:g}"))
@@ -92,7 +92,8 @@ def put_direct(writer: formats.Writer, lighting: LightingStore, keep: int, threa
             own = receivers[start : start + BLOCK]
             bits, normals = lighting.bits_of(own), lighting.normal[own]
             rows = slice(start, start + len(own))
-            index[rows], scale[rows], value[rows] = direct_transfer(bits, normals, factors, keep, threads)
+            index[rows], scale[rows], found = direct_transfer(bits, normals, factors, keep, threads)
+            value[rows] = found.swapaxes(1, 2)
             for target, table in zip(lobes, lobe_visibility(bits, normals, degrees, threads), strict=True):
                 target[rows] = table
             writer.record(block, {"seconds": time.perf_counter() - clock, "receivers": len(own)})
@@ -111,19 +112,21 @@ class DirectTensors:
     def set_light(self, sky: SkyCube) -> None:
         """`even` (N, 3) becomes the irradiance over pi; the lobes get their skies."""
         light = light_coefficients(sky.radiance())
+        self.even = np.zeros_like(self.even)  # a new array: what was made of the old one is told by it
         for group in self.groups:
             group.set_light(sky, light, self.lighting.threads)
             self.even[group.receiver] = np.maximum(group.incident[:, -1], 0.0)
 
     def specular(
-        self, table: MaterialTable, view: NDArray[np.float32]
+        self, table: MaterialTable, view: NDArray[np.float32], active: NDArray[np.bool_] | None
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Specular exit radiance (N, 3) towards view (N, 3), and which receivers have one from here, (N,)."""
+        """Specular exit radiance (N, 3) towards view (N, 3) of `active` receivers (N,), 0 of others; and which
+        receivers have one from here, (N,)."""
         out = np.zeros((len(self.lighting), 3), np.float32)
         known = np.zeros(len(self.lighting), bool)
         for group in self.groups:
             if group.name != MATTE:
-                out[group.receiver] = np.maximum(group.specular(table, view, self.lighting.threads), 0.0)
+                out[group.receiver] = np.maximum(group.specular(table, view, active, self.lighting.threads), 0.0)
                 known[group.receiver] = True
         return out, known
 
@@ -134,7 +137,7 @@ class _Group:
         read: Any = lighting.store.read
         self.receiver: NDArray[np.int32] = read(f"direct/{name}/receiver")
         self.index, self.scale = read(f"direct/{name}/index"), read(f"direct/{name}/scale")
-        self.value = read(f"direct/{name}/value")
+        self.value = np.ascontiguousarray(read(f"direct/{name}/value").swapaxes(1, 2))
         self.normal = np.ascontiguousarray(lighting.normal[self.receiver])
         material = lighting.geometry.material[lighting.object[self.receiver]]
         self.rows = {int(m): np.flatnonzero(material == m) for m in np.unique(material)}
@@ -154,10 +157,15 @@ class _Group:
         if self.name != MATTE:
             self.skies = prefiltered_sky(sky, self.degrees, threads=threads)
 
-    def specular(self, table: MaterialTable, view: NDArray[np.float32], threads: int) -> NDArray[np.float32]:
+    def specular(
+        self, table: MaterialTable, view: NDArray[np.float32], active: NDArray[np.bool_] | None, threads: int
+    ) -> NDArray[np.float32]:
         towards = view[self.receiver]
         black = np.zeros(3, np.float32)
-        for m, rows in self.rows.items():
+        if active is not None:
+            self.out[:] = 0.0
+        for m, all_rows in self.rows.items():
+            rows = all_rows if active is None else all_rows[active[self.receiver[all_rows]]]
             row = table.parameters[m]
             colour = row[SPECULAR_COLUMN : SPECULAR_COLUMN + 3].astype(np.float32)
             if not colour.any():

@@ -100,3 +100,9 @@ def test_scales_beyond_float32_are_refused() -> None:
 def test_unknown_codes_are_refused() -> None:
     with pytest.raises(ValueError, match="is not one of int8, uint8, int16"):
         quantise(np.zeros(3), "int4")  # type: ignore[arg-type]
+
+
+def test_least_scale():
+    codes, scale = quantise(np.array([[127.0, 0.6], [2.6, 1.4], [0.3, 0.4], [0.0, 0.0]]), "int8", least=1.0)
+    np.testing.assert_array_equal(scale, [[1.0], [1.0], [1.0], [0.0]])
+    np.testing.assert_array_equal(codes, [[127, 1], [3, 1], [0, 0], [0, 0]])

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from relightcli.core.sphere import cube
 
+TABLE = 1 << 13
 STRIPS = 8  # meridian strips for each texel along a face's side, at least
 
 
@@ -60,13 +61,14 @@ def latlong_to_cube(radiance: NDArray[np.float32], resolution: int, rotate_degre
     row_edges = np.cos(math.pi * np.arange(height + 1) / height)[::-1].copy()  # rising s, from the south pole
     row_half_angles = 0.5 * (np.arcsin(row_edges) + row_edges * np.sqrt(np.maximum(0.0, 1.0 - row_edges**2)))
     source = np.ascontiguousarray(radiance, np.float32)
+    table = _half_angles()
     parts = [np.zeros((6 * resolution * resolution, 3, 4)) for _ in range(2)]
     cut = len(column_of) // 2
     with ThreadPoolExecutor(2) as pool:
         list(
             pool.map(
                 lambda a, b, out: _walk(
-                    source, column_of[a:b], borders[a : b + 1], row_edges, row_half_angles, resolution, out
+                    source, column_of[a:b], borders[a : b + 1], row_edges, row_half_angles, table, resolution, out
                 ),
                 (0, cut),
                 (cut, len(column_of)),
@@ -92,26 +94,35 @@ def _strip_meridians(resolution: int) -> NDArray[np.float64]:
     return np.concatenate([np.arctan2(corners[:, 0].astype(np.float64), corners[:, 1].astype(np.float64)), even])
 
 
-@njit(cache=True, nogil=True)
-def _half_angle(s):  # type: ignore[no-untyped-def]
-    """Antiderivative of cos(latitude) = sqrt(1 - s^2)."""
-    c = 1.0 - s * s
-    if c <= 0.0:
-        return 0.25 * math.pi if s > 0 else -0.25 * math.pi
-    return 0.5 * (math.asin(s) + s * math.sqrt(c))
+@lru_cache(maxsize=1)
+def _half_angles() -> NDArray[np.float64]:
+    """(atan x + x / (1 + x^2)) / 2 for x from 0 to 1.5, in steps so small that between them it is straight to 1e-8: the
+    antiderivative of cos(latitude) = sqrt(1 - s^2) over s, at the latitude whose tangent is x."""
+    x = np.linspace(0.0, 1.5, TABLE + 1)
+    return 0.5 * (np.arctan(x) + x / (1.0 + x * x))
 
 
 @njit(cache=True, nogil=True)
-def _walk(radiance, column_of, borders, row_edges, row_half_angles, resolution, out):  # type: ignore[no-untyped-def]
+def _half_angle(table, x):  # type: ignore[no-untyped-def]
+    place = abs(x) * (TABLE / 1.5)
+    k = int(place)
+    value = table[k] + (place - k) * (table[k + 1] - table[k])
+    return value if x >= 0.0 else -value
+
+
+@njit(cache=True, nogil=True)
+def _walk(radiance, column_of, borders, row_edges, row_half_angles, table, resolution, out):  # type: ignore[no-untyped-def]
     height = len(row_edges) - 1
     edges = np.empty(6 * resolution + 8)
+    half_angles = np.empty(6 * resolution + 8)
     texels = np.empty(6 * resolution + 8, np.int64)
+    total = np.empty((3, 3))  # of a texel, per colour: over s, over s times cos(latitude), over s^2 / 2
     for strip in range(len(column_of)):
         low, high = borders[strip], borders[strip + 1]
         if high - low < 1e-14:
             continue
         middle = 0.5 * (low + high)
-        count = _meridian(math.sin(middle), math.cos(middle), resolution, edges, texels)
+        count = _meridian(math.sin(middle), math.cos(middle), resolution, table, edges, half_angles, texels)
         column = column_of[strip]
         width = high - low
         # integral of (sin, cos) of the longitude over the strip
@@ -120,43 +131,47 @@ def _walk(radiance, column_of, borders, row_edges, row_half_angles, resolution, 
         s = -1.0
         row, k = 0, 0
         below = row_half_angles[0]
+        total[:] = 0.0
         while row < height and k < count:
+            next_row, next_k = row, k
             if row_edges[row + 1] <= edges[k + 1]:
-                top = row_edges[row + 1]
-                above = row_half_angles[row + 1]
-                next_row, next_k = row + 1, k
-                if row_edges[row + 1] == edges[k + 1]:
-                    next_k = k + 1
+                top, above = row_edges[row + 1], row_half_angles[row + 1]
+                next_row += 1
+                if top == edges[k + 1]:
+                    next_k += 1
             else:
-                top = edges[k + 1]
-                above = _half_angle(top)
-                next_row, next_k = row, k + 1
+                top, above = edges[k + 1], half_angles[k + 1]
+                next_k += 1
             if top > s:
-                area = width * (top - s)
-                level = 0.5 * width * (top * top - s * s)
-                across = above - below
-                texel = texels[k]
+                area, across, level = top - s, above - below, 0.5 * (top * top - s * s)
                 for c in range(3):
                     value = np.float64(radiance[height - 1 - row, column, c])
-                    out[texel, c, 0] += value * area
-                    out[texel, c, 1] += value * wx * across
-                    out[texel, c, 2] += value * level
-                    out[texel, c, 3] += value * wz * across
+                    total[c, 0] += value * area
+                    total[c, 1] += value * across
+                    total[c, 2] += value * level
                 s, below = top, above
+            if next_k != k or next_row == height:
+                to = out[texels[k]]
+                for c in range(3):
+                    to[c, 0] += width * total[c, 0]
+                    to[c, 1] += wx * total[c, 1]
+                    to[c, 2] += width * total[c, 2]
+                    to[c, 3] += wz * total[c, 1]
+                total[:] = 0.0
             row, k = next_row, next_k
 
 
 @njit(cache=True, nogil=True)
-def _meridian(sin_l, cos_l, resolution, edges, texels):  # type: ignore[no-untyped-def]
+def _meridian(sin_l, cos_l, resolution, table, edges, half_angles, texels):  # type: ignore[no-untyped-def]
     """Texels met along a meridian from the south to the north pole, with the s = sin(latitude) of their borders.
 
-    Returns their number n; texel k spans edges[k]..edges[k + 1].
+    Returns their number n; texel k spans edges[k]..edges[k + 1]. half_angles: the antiderivative of cos(latitude).
     """
     r = resolution
-    count = 0
-    edges[0] = -1.0
     # -Y face: from the pole outwards; s = x = rho sin, t = -z = -rho cos, with rho = -1 / tan(latitude).
-    count = _cap(sin_l, -cos_l, r, 3, -1, count, edges, texels)
+    cap = _cap(sin_l, -cos_l, r, 3, table, 0, edges, half_angles, texels)
+    for k in range(cap + 1):
+        edges[k], half_angles[k] = -edges[k], -half_angles[k]
     # Side face: tan(latitude) = m v with v = -t from -1 to 1.
     if abs(sin_l) > abs(cos_l):
         face = 0 if sin_l > 0 else 1
@@ -167,62 +182,65 @@ def _meridian(sin_l, cos_l, resolution, edges, texels):  # type: ignore[no-untyp
         m = abs(cos_l)
         right = sin_l if cos_l > 0 else -sin_l
     column = min(max(math.floor((right / m + 1.0) * 0.5 * r), 0), r - 1)
+    count = cap
     for i in range(r):
         v = m * (2.0 * (i + 1) / r - 1.0)
         texels[count] = (face * r + (r - 1 - i)) * r + column
         count += 1
         edges[count] = v / math.sqrt(1.0 + v * v)
-    # +Y face: from the rim inwards; s = x, t = z.
-    count = _cap(sin_l, cos_l, r, 2, 1, count, edges, texels)
-    edges[count] = 1.0
+        half_angles[count] = _half_angle(table, v)
+    # +Y face: from the rim inwards; s = x, t = z. Written from the pole outwards, then turned round.
+    start = count
+    count += _cap(sin_l, cos_l, r, 2, table, start, edges, half_angles, texels)
+    i, j = start, count - 1
+    while i < j:
+        texels[i], texels[j] = texels[j], texels[i]
+        i += 1
+        j -= 1
+    i, j = start, count
+    while i < j:
+        edges[i], edges[j] = edges[j], edges[i]
+        half_angles[i], half_angles[j] = half_angles[j], half_angles[i]
+        i += 1
+        j -= 1
     return count
 
 
 @njit(cache=True, nogil=True)
-def _cap(ds, dt, resolution, face, sign, count, edges, texels):  # type: ignore[no-untyped-def]
-    """Texels of a pole face along the ray rho (ds, dt), rho from 0 to the rim; inwards (rim to pole) if sign > 0."""
+def _cap(ds, dt, resolution, face, table, first, edges, half_angles, texels):  # type: ignore[no-untyped-def]
+    """Texels of a pole face along the ray rho (ds, dt) from the pole to the rim, from place `first` on, and their
+    borders as on the northern face. Returns their number."""
     r = resolution
-    start = count
     column = r // 2 if ds >= 0 else r // 2 - 1
     row = r // 2 if dt >= 0 else r // 2 - 1
     step_c = 1 if ds >= 0 else -1
     step_r = 1 if dt >= 0 else -1
-    crossed_c, crossed_r = 0, 0
+    # rho of the next border of a column, and of a row
+    across_c = (2.0 / r) / abs(ds) if ds != 0.0 else math.inf
+    across_r = (2.0 / r) / abs(dt) if dt != 0.0 else math.inf
+    crossed_c, crossed_r = 1, 1
     rim = 1.0 / max(abs(ds), abs(dt))
+    edges[first], half_angles[first] = 1.0, 0.25 * math.pi
+    count = first
     while True:
-        rho_c = (2.0 * (crossed_c + 1) / r) / abs(ds) if ds != 0.0 else math.inf
-        rho_r = (2.0 * (crossed_r + 1) / r) / abs(dt) if dt != 0.0 else math.inf
+        rho_c, rho_r = crossed_c * across_c, crossed_r * across_r
         rho = min(rho_c, rho_r)
         texels[count] = (face * r + row) * r + column
         count += 1
         last = rho >= rim * (1.0 - 1e-12)
-        edges[count] = 1.0 / math.sqrt(1.0 + (rim * rim if last else rho * rho))
         if last:
-            break
+            rho = rim
+        square = 1.0 / (1.0 + rho * rho)
+        edges[count] = math.sqrt(square)
+        half_angles[count] = 0.25 * math.pi - _half_angle(table, rho) + rho * square
+        if last:
+            return count - first
         if rho_c <= rho:
             crossed_c += 1
             column += step_c
         if rho_r <= rho:
             crossed_r += 1
             row += step_r
-    if sign < 0:
-        for k in range(start + 1, count + 1):
-            edges[k] = -edges[k]
-    else:
-        # Written from the pole outwards; turn round: texel a..b with s falling becomes rising.
-        i, j = start, count - 1
-        while i < j:
-            texels[i], texels[j] = texels[j], texels[i]
-            i += 1
-            j -= 1
-        # edges[start] is the rim, kept; inner borders reverse; the last is the pole.
-        i, j = start + 1, count - 1
-        while i < j:
-            edges[i], edges[j] = edges[j], edges[i]
-            i += 1
-            j -= 1
-        edges[count] = 1.0
-    return count
 
 
 def splat(sky: SkyCube) -> SkyCube:

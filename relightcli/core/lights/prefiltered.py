@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -25,10 +25,10 @@ from relightcli.core.lights.environment import SkyCube
 from relightcli.core.shade.gather import in_parts
 from relightcli.core.sphere import cube
 
-# exp(x) as (1 + x / 2^10)^(2^10): within 1e-3 of the peak.
-_POWER = 1024.0
 # A lobe is summed over this many standard deviations.
-_REACH = 4.5
+_REACH = 4.0
+# Texels along the side of a tile.
+_TILE = 4
 # Node spacing in standard deviations, on the mean; and what source texels may be at most.
 _SPACING, _SOURCE = 0.6, 0.62
 
@@ -69,44 +69,74 @@ def _meeting_texels(r: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     return around, (weight / weight.sum(1, keepdims=True)).astype(np.float32)
 
 
+class _Plan(NamedTuple):
+    """Where the light of a lobe comes from. The tiles near node m are tile[start[m] : start[m + 1]], and weight
+    (pairs, T) float32 is the lobe's kernel, of integral 1, at the centres of their T texels."""
+
+    node: NDArray[np.float32]
+    start: NDArray[np.int64]
+    tile: NDArray[np.int32]
+    weight: NDArray[np.float32]
+    source: int
+    narrow: float
+
+
 def _gaussian(sky: SkyCube, degrees: float, threads: int) -> NDArray[np.float32]:
-    sigma = math.radians(degrees) / 3.0
-    n = max(4, round(0.5 * math.pi / (_SPACING * sigma)))
-    spacing = math.sqrt(4.0 * math.pi / 6.0) / n
-    narrow = math.sqrt(sigma * sigma - spacing * spacing / 6.0)
-    source = sky.resolution
-    while source > 8 and 0.5 * math.pi / (source // 2) <= _SOURCE * sigma:
-        source //= 2
-    shrink = sky.resolution // source
+    plan = _plan(sky.resolution, degrees, threads)
+    source, shrink = plan.source, sky.resolution // plan.source
     flux = sky.flux.reshape(6, source, shrink, source, shrink, 3).sum(axis=(2, 4)).reshape(-1, 3)
     moment = sky.moment.sum(axis=1).reshape(6, source, shrink, source, shrink, 3).sum(axis=(2, 4)).reshape(-1, 3)
     length = np.sqrt((moment**2).sum(1, keepdims=True))
     center = cube.texel_directions(source).reshape(-1, 3)
-    direction = np.where(length > 0.0, moment / np.where(length > 0.0, length, 1.0), center)
-    tile = max(1, source // 8)
-    tiles = cube.texel_directions(source // tile).reshape(-1, 3)
-    node = _nodes(n).reshape(-1, 3).astype(np.float32)
-    out = np.zeros((len(node), 4), np.float32)
-    # exp(-t^2 / (2 sigma^2)) over its integral, with x = 2 - 2 cos t for t^2 as in `_convolve`.
+    away = np.where(length > 0.0, moment / np.where(length > 0.0, length, 1.0) - center, 0.0)
+    light = _by_tile(np.concatenate([flux, away / plan.narrow**2], axis=1), source)
+    out = np.zeros((len(plan.node), 4), np.float32)
+    in_parts(
+        lambda a, b: _convolve(plan.node[a:b], plan.start[a : b + 1], plan.tile, plan.weight, light, out[a:b]),
+        len(plan.node),
+        threads,
+    )
+    n = math.isqrt(len(plan.node) // 6)
+    return out.reshape(6, n, n, 4)
+
+
+@lru_cache(maxsize=8)
+def _plan(resolution: int, degrees: float, threads: int) -> _Plan:
+    sigma = math.radians(degrees) / 3.0
+    n = max(4, round(0.5 * math.pi / (_SPACING * sigma)))
+    spacing = math.sqrt(4.0 * math.pi / 6.0) / n
+    narrow = math.sqrt(sigma * sigma - spacing * spacing / 6.0)
+    source = resolution
+    while source > 8 and 0.5 * math.pi / (source // 2) <= _SOURCE * sigma:
+        source //= 2
     end = min(math.pi, _REACH * narrow)
     t = np.linspace(0.0, end, 4001)
-    scale = 1.0 / (2.0 * math.pi * float(np.trapezoid(np.exp(-0.5 * (t / narrow) ** 2) * np.sin(t), t)))
-    arguments = (
-        _by_tile(np.concatenate([direction, scale * flux], axis=1), source, tile),
-        tiles.astype(np.float32),
-        np.float32(math.cos(min(math.pi, end + 1.5 / (source // tile)))),
-        np.float32(2.0 - 2.0 * math.cos(end)),
-        np.float32(-0.5 / (narrow * narrow * _POWER)),
+    integral = 2.0 * math.pi * float(np.trapezoid(np.exp(-0.5 * (t / narrow) ** 2) * np.sin(t), t))
+    node = _nodes(n).reshape(-1, 3).astype(np.float32)
+    side = source // min(_TILE, source)
+    tiles = cube.texel_directions(side).reshape(-1, 3).astype(np.float32)
+    near = np.float32(math.cos(min(math.pi, end + 1.5 / side)))
+    count = np.zeros(len(node), np.int64)
+    in_parts(lambda a, b: _count(node[a:b], tiles, near, count[a:b]), len(node), threads)
+    start = np.concatenate([[0], np.cumsum(count)])
+    center = _by_tile(cube.texel_directions(source).reshape(-1, 3), source)
+    tile = np.empty(start[-1], np.int32)
+    weight = np.empty((start[-1], center.shape[2]), np.float32)
+    kernel = (near, 2.0 - 2.0 * math.cos(end), -0.5 / narrow**2, 1.0 / integral)
+    in_parts(
+        lambda a, b: _weigh(node[a:b], start[a:b], tiles, center, *kernel, tile, weight),
+        len(node),
+        threads,
     )
-    in_parts(lambda a, b: _convolve(node[a:b], *arguments, out[a:b]), len(node), threads)
-    return out.reshape(6, n + 1, n + 1, 4)
+    return _Plan(node, start, tile, weight, source, narrow)
 
 
-def _by_tile(values: NDArray[np.float64], source: int, tile: int) -> NDArray[np.float32]:
-    """Per tile of texels, which are in rows: (tiles, 6, tile tile) float32 of values (6 R R, 6)."""
+def _by_tile(values: NDArray[np.float64], source: int) -> NDArray[np.float32]:
+    """Per tile of texels, which are in rows: (tiles, k, T) float32 of values (6 R R, k)."""
+    tile = min(_TILE, source)
     side = source // tile
-    found = values.reshape(6, side, tile, side, tile, 6).transpose(0, 1, 3, 5, 2, 4)
-    return np.ascontiguousarray(found.reshape(6 * side * side, 6, tile * tile), np.float32)
+    found = values.reshape(6, side, tile, side, tile, -1).transpose(0, 1, 3, 5, 2, 4)
+    return np.ascontiguousarray(found.reshape(6 * side * side, -1, tile * tile), np.float32)
 
 
 def _nodes(n: int) -> NDArray[np.float64]:
@@ -115,36 +145,47 @@ def _nodes(n: int) -> NDArray[np.float64]:
     return np.stack([cube.face_directions(face, edge[None, :], edge[:, None]) for face in range(6)])
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
-def _convolve(node, light, tiles, near, end, exponent, out):  # type: ignore[no-untyped-def]
-    """light (tiles, 6, texels): direction, and flux over the kernel's integral. The exponential is a power, so that the
-    loop over a tile becomes vector instructions."""
-    one, two = np.float32(1.0), np.float32(2.0)
+@njit(cache=True, nogil=True)
+def _count(node, tiles, near, count):  # type: ignore[no-untyped-def]
+    for m in range(len(node)):
+        for c in range(len(tiles)):
+            if node[m, 0] * tiles[c, 0] + node[m, 1] * tiles[c, 1] + node[m, 2] * tiles[c, 2] >= near:
+                count[m] += 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _weigh(node, start, tiles, center, near, end, exponent, scale, tile, weight):  # type: ignore[no-untyped-def]
     for m in range(len(node)):
         x, y, z = node[m, 0], node[m, 1], node[m, 2]
-        red = green = blue = np.float32(0.0)
+        p = start[m]
         for c in range(len(tiles)):
             if x * tiles[c, 0] + y * tiles[c, 1] + z * tiles[c, 2] < near:
                 continue
-            of = light[c]
-            for t in range(of.shape[1]):
-                q = max(two - two * (x * of[0, t] + y * of[1, t] + z * of[2, t]), np.float32(0.0))
+            tile[p] = c
+            for t in range(center.shape[2]):
+                q = max(2.0 - 2.0 * (x * center[c, 0, t] + y * center[c, 1, t] + z * center[c, 2, t]), 0.0)
                 # t^2 = q + q^2 / 12 + q^3 / 90 + ... of the chord's square q
-                w = one + exponent * q * (one + q * (np.float32(1.0 / 12.0) + q * np.float32(1.0 / 90.0)))
-                w *= w
-                w *= w
-                w *= w
-                w *= w
-                w *= w
-                w *= w
-                w *= w
-                w *= w
-                w *= w
-                w *= w
-                w = w if q < end else np.float32(0.0)
-                red += w * of[3, t]
-                green += w * of[4, t]
-                blue += w * of[5, t]
+                square = q * (1.0 + q * (1.0 / 12.0 + q * (1.0 / 90.0)))
+                weight[p, t] = scale * math.exp(exponent * square) if q < end else 0.0
+            p += 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+def _convolve(node, start, tile, weight, light, out):  # type: ignore[no-untyped-def]
+    """light (tiles, 6, T): flux, and the way from a texel's centre to its light over the kernel's variance. With it
+    the kernel is exp(r . way) times that at the centre; the series is within 1 % of the peak."""
+    one = np.float32(1.0)
+    for m in range(len(node)):
+        x, y, z = node[m, 0], node[m, 1], node[m, 2]
+        red = green = blue = np.float32(0.0)
+        for p in range(start[m], start[m + 1]):
+            of, w = light[tile[p]], weight[p]
+            for t in range(w.shape[0]):
+                u = x * of[3, t] + y * of[4, t] + z * of[5, t]
+                v = w[t] * (one + u * (one + u * (np.float32(0.5) + u * np.float32(1.0 / 6.0))))
+                red += v * of[0, t]
+                green += v * of[1, t]
+                blue += v * of[2, t]
         out[m, 0], out[m, 1], out[m, 2] = red, green, blue
 
 

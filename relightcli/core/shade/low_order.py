@@ -68,6 +68,7 @@ def response(model: int, row: NDArray[np.float64], order: int) -> NDArray[np.flo
 
 
 def shade_low_order(
+    rows: NDArray[np.int64],
     light: NDArray[np.float32],
     uniform: NDArray[np.float32],
     normals: NDArray[np.float32],
@@ -78,25 +79,25 @@ def shade_low_order(
     threads: int = 1,
 ) -> NDArray[np.float32]:
     """Specular exit radiance (2, n, 3) float32 towards view (n, 3): of light (n, 3, order^2) in the receivers' frames,
-    and of light that is the same from everywhere, uniform (n, 3).
+    and of light that is the same from everywhere, uniform (n, 3). Of the receivers `rows` alone; of others 0.
 
     normals (n, 3); table (M, POLAR, B) from `response`; colour (M, 3), the specular colour; material (n,).
     """
-    out = np.empty((2, len(light), 3), np.float32)
+    out = np.zeros((2, len(light), 3), np.float32)
     order = math.isqrt(light.shape[2])
 
     def part(a: int, b: int) -> None:
-        _shade(light[a:b], uniform[a:b], normals[a:b], view[a:b], table, colour, material[a:b], order, out[:, a:b])
+        _shade(rows[a:b], light, uniform, normals, view, table, colour, material, order, out)
 
-    in_parts(part, len(light), threads)
+    in_parts(part, len(rows), threads)
     return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
-def _shade(light, uniform, normals, view, table, colour, material, order, out):  # type: ignore[no-untyped-def]
+def _shade(rows, light, uniform, normals, view, table, colour, material, order, out):  # type: ignore[no-untyped-def]
     c, s = np.empty(order, np.float32), np.empty(order, np.float32)
     even = np.float32(math.sqrt(4.0 * math.pi))
-    for i in range(len(light)):
+    for i in rows:
         axes = axes_of((np.float64(normals[i, 0]), np.float64(normals[i, 1]), np.float64(normals[i, 2])))
         x = y = z = 0.0
         for k in range(3):
@@ -104,8 +105,6 @@ def _shade(light, uniform, normals, view, table, colour, material, order, out): 
             y += axes[1][k] * view[i, k]
             z += axes[2][k] * view[i, k]
         if not z > 0.0:
-            for k in range(3):
-                out[0, i, k] = out[1, i, k] = np.float32(0.0)
             continue
         length = math.sqrt(x * x + y * y)
         scale = 1.0 / length if length > 0.0 else 0.0

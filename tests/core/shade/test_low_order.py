@@ -41,7 +41,7 @@ def test_specular_exit_radiance_is_the_integral_over_the_light(model: int, width
     table = response(model, row, ORDER)[None]
     one = np.ones((1, 3), np.float32)
     got, uniform = shade_low_order(
-        local, np.repeat(one, 5, 0), normals, view.astype(np.float32), table, one, np.zeros(5, np.int32)
+        np.arange(5), local, np.repeat(one, 5, 0), normals, view.astype(np.float32), table, one, np.zeros(5, np.int32)
     )
     light = np.einsum("ds,nsc->ndc", sh.harmonics(DIRECTIONS, ORDER), world)
     for i in range(5):
