@@ -171,7 +171,9 @@ def long_job(path: Path) -> None:
 
 
 def random_kills(folder: Path, kills: int = 20) -> dict[str, Any]:
+    started = time.monotonic()
     assert in_child(lambda: long_job(folder / "whole.zarr")) == 0
+    whole = time.monotonic() - started
     moments = random.Random(2006)
     stores, landed, resumed = 0, 0, 0
     different = []
@@ -183,7 +185,7 @@ def random_kills(folder: Path, kills: int = 20) -> dict[str, Any]:
             if child == 0:
                 long_job(path)
                 os._exit(0)
-            time.sleep(moments.uniform(0.0, 0.15))
+            time.sleep(moments.uniform(0.0, whole))
             if landed < kills:
                 os.kill(child, signal.SIGKILL)
             code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
