@@ -102,11 +102,11 @@ def errors(setting: Setting, folder: Path, skies: dict[str, Path]) -> Table:
             image = read_image(out)
             pictures.append({k: image.pixels[..., v[:3]] for k, v in image.layers().items() if len(v) >= 3})
         a, b = pictures
-        layers = ("", "direct", "one_bounce", "two_bounce")
+        layers = ("", "direct", "specular", "one_bounce", "two_bounce")
         rows.append((name, *(100.0 * relative_rmse(b[layer], a[layer]) for layer in layers)))
     return Table(
         "error of the asset against the transfer store, %",
-        ("sky", "picture", "direct", "one bounce", "two"),
+        ("sky", "picture", "direct", "specular", "one bounce", "two"),
         tuple(rows),
     )
 

@@ -25,7 +25,6 @@ KEEP = (32, 96, 256)
 RECEIVERS = 36_000
 EYE = (1.6, 1.7, 3.4)
 # Lobes beside the paper's four.
-WIDE = (0.0, 7.0, 14.0, 21.0, 32.0, 48.0)
 
 
 def knot_on_ground(along: int, sides: int) -> tuple[Any, Any, Any]:
@@ -64,7 +63,6 @@ def least_ms(work: Callable[[], Any], times: int = 7) -> float:
 
 def measure(setting: Setting) -> Report:
     from relightcli.core.brdf import direct_model as dm
-    from relightcli.core.brdf.specular_lobes import LOBES
     from relightcli.core.lights.sky import sky_latlong
 
     bits, normals, views = knot_on_ground(*((40, 10) if setting.quick else (80, 24)))
@@ -79,8 +77,7 @@ def measure(setting: Setting) -> Report:
     exact = exact_radiance(bits, normals, views, skies)
     rows: list[tuple[str | int | float, ...]] = []
     models = {}
-    variants = [("", dm.RANKS["cook-torrance"], LOBES), ("n_h = 4, n_o = 8: ", (4, 8, 8), LOBES)]
-    variants.append(("lobes of 32 and 48 degrees too: ", dm.RANKS["cook-torrance"], WIDE))
+    variants = [("", dm.RANKS["cook-torrance"], dm.DEGREES), ("n_h = 4, n_o = 8: ", (4, 8, 8), dm.DEGREES)]
     for label, ranks, degrees in variants:
         clock = time.perf_counter()
         models[label] = dm.build_direct_model("cook-torrance", points, ranks, degrees, resolution)

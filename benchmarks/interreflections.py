@@ -19,7 +19,7 @@ from benchmarks.report import Report, Row, Table
 from benchmarks.scenes import Setting
 
 BOUNCES = 2
-LAYERS = ("", "direct", "one_bounce", "two_bounce")
+LAYERS = ("", "direct", "specular", "one_bounce", "two_bounce")
 LIMIT = {False: 3.0, True: 6.0}  # %, diffuse and glossy scenes
 FLIP_LIMIT = 0.05
 REPEATS = 3
@@ -39,6 +39,8 @@ def read(path: Path) -> Picture:
 def error(ours: NDArray[np.float32], a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
     """Relative RMS of ours in %, without the noise of the references a and b."""
     x, y, z = (p.astype(np.float64) for p in (ours, a, b))
+    if not y.any():
+        return 0.0 if not x.any() else float("inf")
     return 100.0 * float(np.sqrt(max(0.0, np.mean((x - y) * (x - z)) / np.mean(y * z))))
 
 
@@ -86,7 +88,7 @@ def measure(setting: Setting) -> Report:
                 ours = read(output)
                 found = [error(ours[name], a[name], b[name]) for name in LAYERS]
                 flip = float(flip_hdr(ours[""], 0.5 * (a[""] + b[""])).mean())
-                means = [float(ours[n].mean() / (0.5 * (a[n] + b[n])).mean()) for n in LAYERS[1:]]
+                means = [float(ours[n].mean() / max((0.5 * (a[n] + b[n])).mean(), 1e-30)) for n in LAYERS[1:]]
                 kind = "glossy" if scene.glossy else "diffuse"
                 table.append((scene.name, kind, sky, receivers, *found, flip, *means))
                 limit = LIMIT[scene.glossy]

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 import relight_formats as formats
 from relightcli.core.brdf.models import SPECULAR as SPECULAR_COLUMN
 from relightcli.core.brdf.separable import POLAR
-from relightcli.core.lights.environment import SkyCube, latlong_to_cube
+from relightcli.core.lights.environment import SkyCube, latlong_to_cube, splat
 from relightcli.core.shade.gather import in_parts
+from relightcli.core.shade.irradiance import irradiance, moment_prefix
 from relightcli.core.shade.low_order import response, shade_low_order
 from relightcli.core.transport.channels import SHINY, coefficients, plan_channels
 from relightcli.core.transport.transfer import even_projection, local_rotations
@@ -29,7 +30,7 @@ from relightcli.errors import InputError
 from relightcli.scene.model import Material
 from relightcli.stages.direct_tensors import DirectTensors
 from relightcli.stages.lighting import LightingStore, Radiance, _Coats
-from relightcli.stages.transfer_setup import CELLS, COARSE, LAMP_COLUMNS, cell_radiance
+from relightcli.stages.transfer_setup import CELLS, COARSE, LAMP_COLUMNS, cell_radiance, fit_receivers
 
 Factors = NDArray[np.float32]
 
@@ -227,20 +228,29 @@ class _Tensors:
         self._one: NDArray[np.float32] | None = None
         self._two: NDArray[np.float32] | None = None
         self._room: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
+        some = fit_receivers(len(receiver))
+        self._fit_bits, self._fit_normal = asset.bits_of(some), np.ascontiguousarray(asset.normal[some])
+        self._fit = [
+            (read(f"{name}/fit"), read(f"{name}/keep")) for name in ("one_bounce", "two_bounce")[: asset.bounces]
+        ]
 
     def set_light(self, sky: SkyCube) -> None:
         if self._sky is sky:
             return
         self._sky, self._weights = sky, None
-        fine = cell_radiance(sky.flux, sky.resolution, CELLS).astype(np.float32)
-        coarse = cell_radiance(sky.flux, sky.resolution, COARSE).astype(np.float32)
         lamps = np.eye(3, dtype=np.float32)[: self.asset.lamps]
-        light = np.concatenate([self.basis.T @ fine, lamps])  # (L, 3)
+        incident = irradiance(self._fit_bits, self._fit_normal, moment_prefix(splat(sky))) / np.float32(np.pi)
+
+        def matched(bounce: int, mean: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
+            fit, keep = self._fit[bounce]
+            return np.concatenate([fit @ incident + keep @ mean.astype(np.float32), lamps])  # (L, 3)
+
+        light = matched(0, self.basis.T @ cell_radiance(sky.flux, sky.resolution, CELLS))
         reduced = np.matmul(light.T, self.light_factor)  # (C, 3, light eigenvectors)
         one = np.matmul(reduced, self.core)
         self._one = one.reshape(len(one), 3, -1, self.q, self.asset.order**2)
         if self.second is not None:
-            light = np.concatenate([coarse, lamps])
+            light = matched(1, cell_radiance(sky.flux, sky.resolution, COARSE))
             parts = self.second.reshape(*self.second.shape[:2], -1, len(light), self.q)
             self._two = np.einsum("crxlq,lk->crxqk", parts, light, optimize=True)
 

@@ -19,7 +19,6 @@ import relight_formats as formats
 from relightcli import __version__
 from relightcli.core.brdf import direct_model as model
 from relightcli.core.brdf.disc import RESOLUTION
-from relightcli.core.brdf.specular_lobes import LOBES
 from relightcli.errors import StoreError
 
 KIND = "brdf"
@@ -28,7 +27,7 @@ KIND = "brdf"
 def direct_model(
     family: str,
     ranks: tuple[int, int, int] | None = None,
-    degrees: Sequence[float] = LOBES,
+    degrees: Sequence[float] = model.DEGREES,
     measured: bool = False,
     resolution: int = RESOLUTION,
 ) -> model.DirectModel:

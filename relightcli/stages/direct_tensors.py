@@ -23,10 +23,11 @@ from relightcli.core.brdf.direct_model import (
     setting,
 )
 from relightcli.core.brdf.disc import RESOLUTION
-from relightcli.core.brdf.models import F0, ROUGHNESS, SHININESS, MaterialTable
+from relightcli.core.brdf.models import F0, ROUGHNESS, SHININESS, MaterialTable, widen
 from relightcli.core.brdf.models import SPECULAR as SPECULAR_COLUMN
-from relightcli.core.lights.environment import SkyCube
+from relightcli.core.lights.environment import SkyCube, splat
 from relightcli.core.lights.prefiltered import prefiltered_sky
+from relightcli.core.shade.bright import Bright, add_highlights, add_irradiance, split_bright
 from relightcli.core.transport.direct_tensor import direct_light, direct_transfer, light_coefficients, shade_direct
 from relightcli.core.transport.lobe_visibility import add_lobes, lobe_visibility, table_side
 from relightcli.stages.brdf_data import direct_model
@@ -108,14 +109,20 @@ class DirectTensors:
         names = (*FAMILIES, MATTE)
         self.groups = [_Group(lighting, name) for name in names if f"direct/{name}/receiver" in store]
         self.even = np.zeros((len(lighting), 3), np.float32)
+        self.bright: Bright
 
     def set_light(self, sky: SkyCube) -> None:
-        """`even` (N, 3) becomes the irradiance over pi; the lobes get their skies."""
-        light = light_coefficients(sky.radiance())
+        """`even` (N, 3) becomes the irradiance over pi; the lobes get their skies, the brightest texels apart."""
+        lighting = self.lighting
+        rest, self.bright = split_bright(splat(sky))
+        light = light_coefficients(rest.radiance())
         self.even = np.zeros_like(self.even)  # a new array: what was made of the old one is told by it
         for group in self.groups:
-            group.set_light(sky, light, self.lighting.threads)
+            group.set_light(rest, light, lighting.threads)
             self.even[group.receiver] = np.maximum(group.incident[:, -1], 0.0)
+        if len(self.bright.texel):
+            for rows, bits in lighting.blocks():
+                add_irradiance(bits, lighting.normal[rows], self.bright, self.even[rows], lighting.threads)
 
     def specular(
         self, table: MaterialTable, view: NDArray[np.float32], active: NDArray[np.bool_] | None
@@ -123,10 +130,11 @@ class DirectTensors:
         """Specular exit radiance (N, 3) towards view (N, 3) of `active` receivers (N,), 0 of others; and which
         receivers have one from here, (N,)."""
         out = np.zeros((len(self.lighting), 3), np.float32)
+        wide = widen(table, 0.5 * np.pi / self.lighting.resolution)
         known = np.zeros(len(self.lighting), bool)
         for group in self.groups:
             if group.name != MATTE:
-                out[group.receiver] = np.maximum(group.specular(table, view, active, self.lighting.threads), 0.0)
+                out[group.receiver] = group.specular(table, wide, self.bright, view, active, self.lighting.threads)
                 known[group.receiver] = True
         return out, known
 
@@ -158,7 +166,13 @@ class _Group:
             self.skies = prefiltered_sky(sky, self.degrees, threads=threads)
 
     def specular(
-        self, table: MaterialTable, view: NDArray[np.float32], active: NDArray[np.bool_] | None, threads: int
+        self,
+        table: MaterialTable,
+        wide: MaterialTable,
+        bright: Bright,
+        view: NDArray[np.float32],
+        active: NDArray[np.bool_] | None,
+        threads: int,
     ) -> NDArray[np.float32]:
         towards = view[self.receiver]
         black = np.zeros(3, np.float32)
@@ -189,4 +203,18 @@ class _Group:
                 self.out,
                 threads,
             )
+            np.maximum(self.out, 0.0, out=self.out)  # of truncation
+            if len(bright.texel):
+                add_highlights(
+                    self.bits,
+                    rows,
+                    towards,
+                    self.normal,
+                    bright,
+                    int(wide.model[m]),
+                    wide.parameters[m],
+                    colour,
+                    self.out,
+                    threads,
+                )
         return self.out

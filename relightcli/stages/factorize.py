@@ -18,18 +18,18 @@ from numpy.typing import NDArray
 import relight_formats as formats
 from relightcli import __version__
 from relightcli.adapters.files import need_output
-from relightcli.core.compress.tucker import hooi
+from relightcli.core.compress.tucker import sequential_hosvd
 from relightcli.core.transport.direct_tensor import KEEP
+from relightcli.core.transport.transfer import Sources, light_fit
 from relightcli.errors import InputError, StoreError
 from relightcli.stages.cluster import copy_arrays
 from relightcli.stages.direct_tensors import put_direct
 from relightcli.stages.lighting import LightingStore
-from relightcli.stages.transfer_setup import COARSE, TransferSetup, coarse_cells
+from relightcli.stages.transfer_setup import COARSE, TransferSetup, coarse_cells, fit_receivers
 
 KIND = "asset"
-SWEEPS = 1
-# Least step of the one-bounce core, over its norm: all its values rounded to it make 0.5 % of the tensor at full ranks.
-CORE_STEP = 4e-5
+# What rounding may add to the one-bounce core, relative RMS: no step is finer than makes that of all its values.
+CORE_ROUNDING = 0.005
 LEFT_OUT = ("bounce/hit", "light/basis", "cluster/label")  # of the clusters store's arrays
 
 
@@ -131,17 +131,18 @@ def _one_bounce(
         },
         clusters,
         {"core": "int8", "receiver_factor": "int8"},
-        {"core": CORE_STEP},
+        {"core": CORE_ROUNDING},
     )
     todo = [c for c in range(clusters) if f"one-bounce/{c}" not in writer.done]
     if not todo:
         return
     sources = setup.sources(basis)
+    _put_fit(writer, "one_bounce", setup, sources)
     for c in todo:
         clock = time.perf_counter()
         rows = order[start[c] : start[c + 1]]
         tensor = setup.gather_rows(rows, sources, bands).reshape(len(rows), rest, lights)
-        found = hooi(tensor, (rank_v, None, rank_l), sweeps=SWEEPS)
+        found = sequential_hosvd(tensor, (rank_v, None, rank_l))
         u_v, _, u_l = found.factors
         assert u_v is not None
         assert u_l is not None
@@ -160,6 +161,14 @@ def _one_bounce(
                 "error2": error2,
             },
         )
+
+
+def _put_fit(writer: formats.Writer, group: str, setup: TransferSetup, sources: Sources) -> None:
+    """How light is matched by what it does at some receivers."""
+    some = fit_receivers(len(setup.lighting))
+    fit, keep = light_fit(sources.even[some, : sources.even.shape[1] - setup.lamps])
+    writer.put(f"{group}/fit", fit, dims=(f"{group}_light", "fit_receiver"))
+    writer.put(f"{group}/keep", keep, dims=(f"{group}_light", f"{group}_old_light"))
 
 
 def _two_bounces(
@@ -189,12 +198,14 @@ def _two_bounces(
     todo = [c for c in range(clusters) if f"two-bounce/{c}" not in writer.done]
     if not todo:
         return
-    sources = setup.second_sources(setup.sources(coarse_cells()), bands)
+    lights = setup.sources(coarse_cells())
+    _put_fit(writer, "two_bounce", setup, lights)
+    sources = setup.second_sources(lights, bands)
     for c in todo:
         clock = time.perf_counter()
         rows = order[start[c] : start[c + 1]]
         tensor = setup.gather_rows(rows, sources, config.second_order).reshape(len(rows), size, 1)
-        found = hooi(tensor, (rank, None, None), sweeps=0)
+        found = sequential_hosvd(tensor, (rank, None, None))
         u_v = found.factors[0]
         assert u_v is not None
         kept = outputs.put(c, {"receiver_factor": u_v, "core": found.core[:, :, 0]})
@@ -215,7 +226,8 @@ def _two_bounces(
 class _Outputs:
     """Quantised factors, one chunk per cluster; ranks that a cluster does not have are zero.
 
-    codes: types, int16 where none is given; steps: least step over the norm of a cluster's values.
+    codes: types, int16 where none is given; rounding: relative RMS that rounding may add, as little as the type lets if
+    none is given.
     """
 
     def __init__(
@@ -225,9 +237,9 @@ class _Outputs:
         arrays: dict[str, tuple[tuple[int, ...], tuple[str, ...], tuple[int, ...]]],
         clusters: int,
         codes: dict[str, str],
-        steps: dict[str, float],
+        rounding: dict[str, float],
     ) -> None:
-        self.shapes, self.axes, self.codes, self.steps = {}, {}, {}, steps
+        self.shapes, self.axes, self.codes, self.rounding = {}, {}, {}, rounding
         self.values: dict[str, Any] = {}
         self.scales: dict[str, Any] = {}
         for name, (shape, dims, axes) in arrays.items():
@@ -258,7 +270,8 @@ class _Outputs:
         for name, values in found.items():
             padded = np.zeros(self.shapes[name])
             padded[tuple(slice(0, n) for n in values.shape)] = values
-            least = self.steps.get(name, 0.0) * float(np.sqrt((padded**2).sum()))
+            # A step s makes a relative RMS of s sqrt(number / 12) / norm.
+            least = self.rounding.get(name, 0.0) * float(np.sqrt(12.0 * (values**2).mean()))
             codes, scale = formats.quantise(padded, self.codes[name], axis=self.axes[name], least=least)  # type: ignore[arg-type]
             self.values[name][cluster] = codes
             self.scales[name][cluster] = scale

@@ -92,9 +92,9 @@ def check_shots(config: Config, shots: list[Shot], scene: Scene) -> None:
 
 
 def layer_names(count: int) -> list[str]:
-    """Names of light that was reflected once, twice, ... `count` times."""
+    """Names of light that was reflected once, diffusely; twice, ... `count` times; and once, by specular lobes."""
     names = ("direct", "one_bounce", "two_bounce", "three_bounce", "four_bounce")
-    return [names[i] if i < len(names) else f"bounce_{i}" for i in range(count)]
+    return [*(names[i] if i < len(names) else f"bounce_{i}" for i in range(count)), "specular"]
 
 
 def numbered(pattern: str, number: int) -> str:

@@ -135,7 +135,7 @@ def render_reference(config: Config, shots: list[Shot], suffix: str, started: fl
             overwrite=config.overwrite,
         )
         width, height = camera.size
-        layers = bounces + 1 + config.background
+        layers = bounces + 2 + config.background
         if writer is not None:
             with writer:
                 rows = max(1, min(height, PATHS_PER_BLOCK // (width * passes * per_pass)))

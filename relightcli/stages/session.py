@@ -164,7 +164,9 @@ class Session:
         threads = self.config.workers
         layers = {}
         if self.config.layers:
-            for name, part in zip(layer_names(len(parts)), parts, strict=True):
+            direct, *bounced = parts
+            split = [Radiance(direct.diffuse, None), *bounced, Radiance(np.zeros_like(direct.diffuse), direct.specular)]
+            for name, part in zip(layer_names(len(parts)), split, strict=True):
                 flat = picture.assemble(view.matrix, part.diffuse, part.specular, threads)
                 layers[name] = flat.reshape(height, width, 3)
             rgb = np.sum(list(layers.values()), axis=0)

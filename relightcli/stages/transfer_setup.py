@@ -27,7 +27,13 @@ from relightcli.stages.lighting import LightingStore
 CELLS = 8  # of a face of the sky, for one bounce
 COARSE = 2  # the same for two bounces
 LAMP_COLUMNS = 3  # the local lights' light, by colour, comes after the sky's cells
+FIT = 1024  # receivers at which lights are matched by the direct light that they give
 BLOCK = 512  # receivers whose tensors are gathered at a time
+
+
+def fit_receivers(count: int) -> NDArray[np.int64]:
+    """The receivers, of `count`, at which lights are matched, rising."""
+    return np.sort(np.random.default_rng(0).permutation(count)[:FIT])
 
 
 def coarse_cells() -> NDArray[np.float32]:

@@ -17,8 +17,8 @@ def test_quick_run(tmp_path):
     assert done.returncode == 0, done.stderr
     report = json.loads(output.read_text())["runs"]["direct"]["report"]
     (table,) = report["tables"]
-    # Three numbers of coefficients for the default, one for each of two variants; two skies, two f0.
-    assert len(table["rows"]) == (3 + 2) * 4
+    # Three numbers of coefficients for the default, one for the variant; two skies, two f0.
+    assert len(table["rows"]) == (3 + 1) * 4
     for row in table["rows"]:
         assert all(0.0 < error < 2.0 for error in row[3:])
     assert all(row["measured"] > 0.0 for row in report["rows"])

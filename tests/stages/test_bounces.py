@@ -62,6 +62,7 @@ def layers_of(store, name, **settings):
     return read_layers(output)
 
 
+NAMES = ("direct", "specular", "one_bounce", "two_bounce")
 EDIT = ("ground.diffuse=0.2,0.6,0.3", "ball.diffuse=0.8,0.8,0.7", "gold.roughness=0.5", "gold.specular=0.5,0.7,0.9")
 
 
@@ -72,11 +73,11 @@ def test_every_layer_against_the_path_tracer(store, edit):
     # single layers is not known, so their means are compared: at 3,072 pixels and 256 samples they are good to 0.5 %.
     a = layers_of(store, "a.exr", settings=edit)
     b = layers_of(store, "b.exr", settings=edit, reference=True, spp=256)
-    assert set(a) == {"", "A", "direct", "one_bounce", "two_bounce"} == set(b) - {"variance"}
+    assert set(a) == {"", "A", *NAMES} == set(b) - {"variance"}
     noise = np.sqrt(b["variance"].mean() / (b[""] ** 2).mean())
     assert noise < 0.03
     assert relative_rmse(a[""], b[""]) ** 2 - noise**2 < 0.03**2
-    for name in ("direct", "one_bounce", "two_bounce"):
+    for name in NAMES:
         mean = b[name].mean((0, 1))
         assert mean.min() > 0.001
         np.testing.assert_allclose(a[name].mean((0, 1)), mean, rtol=0.03, err_msg=name)
@@ -84,7 +85,7 @@ def test_every_layer_against_the_path_tracer(store, edit):
 
 def test_layers_add_up_and_so_do_bounces(store):
     layers = layers_of(store, "a.exr")
-    parts = layers["direct"] + layers["one_bounce"] + layers["two_bounce"]
+    parts = sum(layers[name] for name in NAMES)
     np.testing.assert_allclose(parts, layers[""], rtol=1e-5, atol=1e-6)
     plain = layers_of(store, "b.exr", layers=False)
     np.testing.assert_allclose(plain[""], layers[""], rtol=1e-4, atol=1e-5)
@@ -92,9 +93,9 @@ def test_layers_add_up_and_so_do_bounces(store):
     np.testing.assert_array_equal(fewer["one_bounce"], layers["one_bounce"])
     np.testing.assert_allclose(fewer[""] + layers["two_bounce"], layers[""], rtol=1e-4, atol=1e-5)
     none = layers_of(store, "d.exr", bounces=0)
-    np.testing.assert_array_equal(none[""], layers["direct"])
+    np.testing.assert_array_equal(none[""], layers["direct"] + layers["specular"])
     more = layers_of(store, "e.exr", bounces=4)
-    assert set(more) == {"", "A", "direct", "one_bounce", "two_bounce", "three_bounce", "four_bounce"}
+    assert set(more) == {"", "A", *NAMES, "three_bounce", "four_bounce"}
     assert 0 < more["four_bounce"].mean() < more["three_bounce"].mean() < more["two_bounce"].mean()
 
 
@@ -210,7 +211,7 @@ def test_mirrors_neither_make_nor_lose_light(tmp_path, cells):
     store = make_store(scene, bounces=3, bounce_resolution=cells, workers=2)
     a = layers_of(store, "a.exr", env="sky")
     b = layers_of(store, "b.exr", env="sky", reference=True, spp=4096)
-    for name in ("direct", "one_bounce", "two_bounce", "three_bounce"):
+    for name in (*NAMES, "three_bounce"):
         # At 8 cells a side the lamp's reflection in a wall is smaller than a cell.
         assert a[name].mean() == pytest.approx(b[name].mean(), rel=0.12 if cells == 8 else 0.03), name
 

@@ -23,7 +23,7 @@ from tests.stages.test_precompute import Stopping, array_bytes
 
 CAMERA = Camera("main", (0.4, 1.3, 2.6), (0, 0.4, 0), fov=38, size=(40, 30))
 OTHER = Camera("other", (-0.4, 1.3, 2.6), (0, 0.4, 0), fov=38, size=(8, 6))
-LAYERS = ("direct", "one_bounce", "two_bounce")
+LAYERS = ("direct", "specular", "one_bounce", "two_bounce")
 PIXELS = "pixels:main"
 COARSE = {"light_resolution": 16, "refine": 2, "bounce_resolution": 8}
 EDIT = ("ground.diffuse=0.2,0.6,0.3", "ball.diffuse=0.8,0.8,0.7", "gold.roughness=0.5", "gold.specular=0.5,0.7,0.9")

@@ -85,8 +85,8 @@ def test_variance_says_how_far_seeds_differ(scene, tmp_path):
 def test_layers_bounces_and_background(scene, tmp_path):
     render(scene, tmp_path / "a.exr", env="white", bounces=2, layers=True, background=True, spp=64)
     layers = read_layers(tmp_path / "a.exr")
-    assert set(layers) == {"", "A", "direct", "one_bounce", "two_bounce", "background", "variance"}
-    total = sum(layers[name] for name in ("direct", "one_bounce", "two_bounce", "background"))
+    assert set(layers) == {"", "A", "direct", "specular", "one_bounce", "two_bounce", "background", "variance"}
+    total = sum(layers[name] for name in ("direct", "specular", "one_bounce", "two_bounce", "background"))
     np.testing.assert_allclose(total, layers[""], rtol=1e-5, atol=1e-6)
     assert (layers["A"] == 1).all()
     # L = 1 everywhere: the background is 1, and albedo below 1 keeps everything else below.

@@ -65,7 +65,7 @@ def test_reference_of_scene_file_and_of_store_are_the_same_picture(scene, store,
     # The store's faces are cut, which moves hit points by roundings; random numbers are the same.
     np.testing.assert_allclose(a["A"], b["A"], atol=1e-3)
     assert relative_rmse(a[""], b[""]) < 0.05
-    np.testing.assert_allclose(b["direct"] + b["one_bounce"], b[""], rtol=2e-3, atol=1e-4)
+    np.testing.assert_allclose(b["direct"] + b["specular"] + b["one_bounce"], b[""], rtol=2e-3, atol=1e-4)
     assert b["one_bounce"].max() > 0.01
     assert not list(tmp_path.glob("*.samples*"))
 
@@ -75,7 +75,7 @@ def test_layers_add_up_to_the_beauty(store, tmp_path, background):
     run(store, tmp_path / "a.exr", layers=True, background=background)
     layers = read_layers(tmp_path / "a.exr")
     parts = [rgb for name, rgb in layers.items() if name not in ("", "A")]
-    assert set(layers) == {"", "A", "direct"} | ({"background"} if background else set())
+    assert set(layers) == {"", "A", "direct", "specular"} | ({"background"} if background else set())
     np.testing.assert_allclose(sum(parts), layers[""], rtol=1e-5, atol=1e-6)
     if background:
         assert (layers["A"] == 1).all()

@@ -107,25 +107,27 @@ def gaussian_samples(degrees: float) -> tuple[NDArray[np.float64], NDArray[np.fl
     return np.stack([sine * np.cos(turn), sine * np.sin(turn), cosine], -1).reshape(-1, 3), weight / weight.sum()
 
 
-def broad_columns(grid: DiscGrid) -> NDArray[np.float64]:
-    """The broad terms (r.w)+^n in every light cell, each row summing to 1: (m, 3, n) float64 for the octant."""
+def broad_columns(grid: DiscGrid, exponents: Sequence[float] = BROAD_EXPONENTS) -> NDArray[np.float64]:
+    """The broad terms (r.w)+^n in every light cell, each row summing to 1: (m, q, n) float64 for the octant."""
     r = grid.direction[grid.octant] * (-1.0, -1.0, 1.0)
     cosine = np.maximum(r @ grid.direction.T, 0.0)
     # dw = dA / cos(theta_i)
-    out = cosine[:, None, :] ** np.array(BROAD_EXPONENTS)[:, None] / grid.direction[:, 2]
+    out = cosine[:, None, :] ** np.array(exponents)[:, None] / grid.direction[:, 2]
     return out / out.sum(-1, keepdims=True)
 
 
-def fit_lobes(brdfs: BrdfSet, degrees: Sequence[float] = LOBES) -> SpecularLobes:
+def fit_lobes(
+    brdfs: BrdfSet, degrees: Sequence[float] = LOBES, broad: Sequence[float] = BROAD_EXPONENTS
+) -> SpecularLobes:
     """Lobe energies of every entry at every theta_o of the grid, by expectation maximisation; `MIRROR` for 0 degrees
-    alone, () for no lobes."""
+    alone, () for no lobes. broad: exponents of the terms that take what is no lobe."""
     grid = brdfs.grid
     radius, ring = np.unique(_square_radius(grid), return_inverse=True)
     energy = np.zeros((len(brdfs), len(radius), len(degrees)))
     if degrees:
         columns = lobe_columns(grid, degrees)
         above = columns.sum(-1)
-        components = np.concatenate([columns / above[..., None], broad_columns(grid)], 1)
+        components = np.concatenate([columns / above[..., None], broad_columns(grid, broad)], 1)
         found = np.stack(
             [
                 expectation_maximisation(fold(grid, entry) * grid.area, components)[:, : len(degrees)] / above

@@ -104,10 +104,20 @@ def join(parts: list[Gather]) -> Gather:
 
 
 def in_parts(work: Callable[[int, int], None], count: int, threads: int) -> None:
-    cuts = np.linspace(0, count, 8 * max(1, threads) + 1).astype(int)
-    with ThreadPoolExecutor(max(1, threads)) as pool:
-        for job in [pool.submit(work, a, b) for a, b in itertools.pairwise(cuts.tolist()) if b > a]:
-            job.result()
+    """Calls work(start, stop) for parts of range(count), on `threads` threads that stay for the next call."""
+    if threads <= 1:
+        if count:
+            work(0, count)
+        return
+    cuts = np.linspace(0, count, 6 * threads + 1).astype(int)
+    pool = _pool(threads)
+    for job in [pool.submit(work, a, b) for a, b in itertools.pairwise(cuts.tolist()) if b > a]:
+        job.result()
+
+
+@lru_cache(maxsize=4)
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads)
 
 
 @njit(cache=True, nogil=True)

@@ -6,6 +6,9 @@ Light that arrives at a point is integrated by two techniques, each drawing one 
 the two densities [Veach 1995, section 4]:  F = f |n.l| L / p  *  p^2 / (p^2 + q^2).
 
 Axes: N surface points; M <= N samples that can matter, each with its point's index in `source`.
+
+Light that has been reflected once is in two layers, by the share of the specular lobe in f and by colour: `share` of
+samples, `shares` of paths.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from relightcli.core.brdf.models import TRANSLUCENT, Triple, dot
+from relightcli.core.brdf.models import LAMBERT, TRANSLUCENT, Triple, dot
 from relightcli.core.brdf.sampling import evaluate_and_pdf, sample_direction
 from relightcli.core.lights.latlong import LatLong, direction_density, lookup, sample
 from relightcli.core.transport.camera import Film, film_direction
@@ -79,13 +82,24 @@ def _passes(model: int, geometric: Triple, shading: Triple, d: Triple) -> bool:
 
 
 @njit(cache=True, error_model="numpy")
+def _share(model: int, albedo: Triple, shading: Triple, d: Triple, f: Triple, c: int) -> float:
+    """Part of the specular lobe in f, which is reflectance times |n.l|."""
+    if model in (LAMBERT, TRANSLUCENT) or f[c] <= 0.0:
+        return 0.0
+    return min(max(1.0 - albedo[c] * max(dot(shading, d), 0.0) / (math.pi * f[c]), 0.0), 1.0)
+
+
+@njit(cache=True, error_model="numpy")
 def sample_environment(
-    scene: ShadingScene, environment: LatLong, surface: Surface, keys: Any, samples: int, dimension: int
-) -> tuple[Any, Any, Any, Any]:
-    """Directions to the environment that matter: (point, below its face, direction, radiance if free)."""
+    scene: ShadingScene, environment: LatLong, surface: Surface, keys: Any, samples: int, dimension: int, shares: Any
+) -> tuple[Any, Any, Any, Any, Any]:
+    """Directions to the environment that matter: (point, below its face, direction, radiance if free, share).
+
+    shares (paths, 3): those to take; of no paths: they are found here.
+    """
     n = len(surface.path)
     source, below = np.empty(n, np.int64), np.empty(n, np.bool_)
-    direction, gain = np.empty((n, 3)), np.empty((n, 3))
+    direction, gain, share = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
     m = 0
     for i in range(n):
         pixel, s = divmod(surface.path[i], samples)
@@ -110,18 +124,23 @@ def sample_environment(
         _put(direction, m, d)
         for c in range(3):
             gain[m, c] = surface.throughput[i, c] * f[c] * radiance[c] * w
+            if len(shares):
+                share[m, c] = shares[surface.path[i], c]
+            else:
+                share[m, c] = _share(scene.model[material], _get(surface.albedo, i), shading, d, f, c)
         m += 1
-    return source[:m], below[:m], direction[:m], gain[:m]
+    return source[:m], below[:m], direction[:m], gain[:m], share[:m]
 
 
 @njit(cache=True, error_model="numpy")
 def sample_lights(
-    scene: ShadingScene, surface: Surface, keys: Any, samples: int, dimension: int
-) -> tuple[Any, Any, Any, Any]:
-    """Points of local lights that matter: (point, below its face, light's point in the world, radiance if free)."""
+    scene: ShadingScene, surface: Surface, keys: Any, samples: int, dimension: int, shares: Any
+) -> tuple[Any, Any, Any, Any, Any]:
+    """Points of local lights that matter: (point, below its face, light's point in the world, radiance if free,
+    share). shares as for `sample_environment`."""
     n = len(surface.path)
     source, below = np.empty(n, np.int64), np.empty(n, np.bool_)
-    target, gain = np.empty((n, 3)), np.empty((n, 3))
+    target, gain, share = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
     m = 0
     for i in range(n):
         pixel, s = divmod(surface.path[i], samples)
@@ -147,15 +166,22 @@ def sample_lights(
         for c in range(3):
             target[m, c] = p[c] + distance * d[c]
             gain[m, c] = surface.throughput[i, c] * f[c] * radiance[c] * w
+            if len(shares):
+                share[m, c] = shares[surface.path[i], c]
+            else:
+                share[m, c] = _share(scene.model[material], _get(surface.albedo, i), shading, d, f, c)
         m += 1
-    return source[:m], below[:m], target[:m], gain[:m]
+    return source[:m], below[:m], target[:m], gain[:m], share[:m]
 
 
 @njit(cache=True, error_model="numpy")
 def sample_reflection(
-    scene: ShadingScene, surface: Surface, keys: Any, samples: int, dimension: int
+    scene: ShadingScene, surface: Surface, keys: Any, samples: int, dimension: int, shares: Any
 ) -> tuple[Any, Any, Any, Any, Any]:
-    """Directions drawn from the reflectance: (point, below its face, direction, new throughput, density)."""
+    """Directions drawn from the reflectance: (point, below its face, direction, new throughput, density).
+
+    shares (paths, 3): set, unless of no paths.
+    """
     n = len(surface.path)
     source, below = np.empty(n, np.int64), np.empty(n, np.bool_)
     direction, throughput, density = np.empty((n, 3)), np.empty((n, 3)), np.empty(n)
@@ -177,23 +203,28 @@ def sample_reflection(
         _put(direction, m, d)
         for c in range(3):
             throughput[m, c] = surface.throughput[i, c] * f[c] / q
+            if len(shares):
+                shares[surface.path[i], c] = _share(model, albedo, shading, d, f, c)
         m += 1
     return source[:m], below[:m], direction[:m], throughput[:m], density[:m]
 
 
 @njit(cache=True, error_model="numpy")
-def add_light(values: Any, layer: int, path: Any, source: Any, gain: Any, blocked: Any) -> None:
-    """Add the sampled light that is not blocked."""
+def add_light(values: Any, layer: int, lobes: int, path: Any, source: Any, gain: Any, blocked: Any, share: Any) -> None:
+    """Add the sampled light that is not blocked, to `layer` and by its share to the layer `lobes`."""
     for i in range(len(source)):
         if not blocked[i]:
             for c in range(3):
-                values[path[source[i]], layer, c] += gain[i, c]
+                values[path[source[i]], layer, c] += gain[i, c] * (1.0 - share[i, c])
+                values[path[source[i]], lobes, c] += gain[i, c] * share[i, c]
 
 
 @njit(cache=True, error_model="numpy")
 def add_found_environment(
     values: Any,
     layer: int,
+    lobes: int,
+    shares: Any,
     path: Any,
     source: Any,
     environment: LatLong,
@@ -207,14 +238,19 @@ def add_found_environment(
         if face[i] < 0:
             radiance = lookup(environment, _get(direction, i))
             w = _power_heuristic(density[i], direction_density(environment, radiance))
+            p = path[source[i]]
             for c in range(3):
-                values[path[source[i]], layer, c] += throughput[i, c] * radiance[c] * w
+                x = throughput[i, c] * radiance[c] * w
+                values[p, layer, c] += x * (1.0 - shares[p, c])
+                values[p, lobes, c] += x * shares[p, c]
 
 
 @njit(cache=True, error_model="numpy")
 def add_found_lights(
     values: Any,
     layer: int,
+    lobes: int,
+    shares: Any,
     scene: ShadingScene,
     surface: Surface,
     source: Any,
@@ -234,8 +270,11 @@ def add_found_lights(
             t, radiance, q = meet_light(scene.lights, light, p, d, total)
             if t < math.inf and t * (1.0 - LIGHT_CLEARANCE) <= free[i]:
                 w = _power_heuristic(density[i], q)
+                path = surface.path[j]
                 for c in range(3):
-                    values[surface.path[j], layer, c] += throughput[i, c] * radiance[c] * w
+                    x = throughput[i, c] * radiance[c] * w
+                    values[path, layer, c] += x * (1.0 - shares[path, c])
+                    values[path, lobes, c] += x * shares[path, c]
 
 
 @njit(cache=True, error_model="numpy")

@@ -26,7 +26,7 @@ from relightcli.core.shade.narrow import cube_texel
 
 # Node spacing in standard deviations of the lobe, on the mean.
 _SPACING = 1.75
-_RINGS, _AZIMUTHS = 6, 12
+_RINGS, _AZIMUTHS = 5, 8
 # A lobe whose energy is at most this part of its material's greatest is left out.
 _NEGLIGIBLE = 1e-4
 _FAST = {"reassoc", "contract", "nsz"}
@@ -43,7 +43,7 @@ def lobe_visibility(
 ) -> tuple[NDArray[np.uint8], ...]:
     """Visible shares v_k times 255 of every lobe wider than 0 degrees, in order: (N, n, n) uint8, n = `table_side`.
 
-    bits (N, 6, R, R/8); normals (N, 3) float32 unit. Each share is that of 72 directions of equal weight.
+    bits (N, 6, R, R/8); normals (N, 3) float32 unit. Each share is that of 40 directions of equal weight.
     """
     words = np.ascontiguousarray(bits).reshape(len(bits), -1)
     normals = np.ascontiguousarray(normals, np.float32)
@@ -64,7 +64,7 @@ def lobe_visibility(
 
 
 def _samples(n: int, sigma: float) -> NDArray[np.float32]:
-    """Directions (n n, 72, 3) that spread like the lobe about each node, less what bilinear look-up will add."""
+    """Directions (n n, 40, 3) that spread like the lobe about each node, less what bilinear look-up will add."""
     spacing = math.sqrt(2.0 * math.pi) / (n - 1)
     narrow = math.sqrt(sigma * sigma - spacing * spacing / 6.0)
     u, v = np.meshgrid(*[np.linspace(-1.0, 1.0, n)] * 2, indexing="ij")
@@ -112,14 +112,15 @@ def add_lobes(
     def part(a: int, b: int) -> None:
         mirror = np.empty((b - a, 6), np.float32)
         share = np.empty(b - a, np.float32)
-        _mirrors(views, normals, rows[a:b], mirror)
+        facing = np.empty(b - a, np.int64)
+        facing = facing[: _mirrors(views, normals, rows[a:b], facing, mirror)]
         for k in used:
             table = of_lobe[k]
             if table is None:
-                _share_of_bits(words, rows[a:b], bits.shape[2], mirror, share)
+                _share_of_bits(words, facing, bits.shape[2], mirror, share)
             else:
-                _share_of_table(table, rows[a:b], mirror, share)
-            _add_lobe(skies[k], rows[a:b], mirror, share, strength[k], ks, out)
+                _share_of_table(table, facing, mirror, share)
+            _add_lobe(skies[k], facing, mirror, share, strength[k], ks, out)
 
     in_parts(part, len(rows), threads)
 
@@ -152,19 +153,25 @@ def _open(words, i, texel):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
-def _mirrors(views, normals, rows, mirror):  # type: ignore[no-untyped-def]
-    """Of the mirror direction (M, 6): x, y, z in the receiver's frame; face of the cube, and s and t on it."""
+def _mirrors(views, normals, rows, facing, mirror):  # type: ignore[no-untyped-def]
+    """Number of the rows that face the viewer, first in `facing`. Of their mirror direction: x, y, z in the receiver's
+    frame; face of the cube, and s and t on it."""
     two = np.float32(2.0)
-    for m in range(len(rows)):
-        i = rows[m]
+    m = 0
+    for i in rows:
         s, t, n = axes_of((normals[i, 0], normals[i, 1], normals[i, 2]))
         vx, vy, vz = views[i, 0], views[i, 1], views[i, 2]
         z = np.float32(n[0] * vx + n[1] * vy + n[2] * vz)
+        if not z > np.float32(0.0):
+            continue
+        facing[m] = i
         mirror[m, 0] = -(s[0] * vx + s[1] * vy + s[2] * vz)
         mirror[m, 1] = -(t[0] * vx + t[1] * vy + t[2] * vz)
         mirror[m, 2] = z
         face, u, v = place_on_cube(two * z * n[0] - vx, two * z * n[1] - vy, two * z * n[2] - vz)
         mirror[m, 3], mirror[m, 4], mirror[m, 5] = face, u, v
+        m += 1
+    return m
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
@@ -208,7 +215,7 @@ def _add_lobe(sky, rows, mirror, share, strength, specular, out):  # type: ignor
     nodes = np.float32(sky.shape[1] - 1)
     for m in range(len(rows)):
         z = mirror[m, 2]
-        if not (z > zero and share[m] > zero):
+        if not share[m] > zero:
             continue
         p = min(z, np.float32(0.99999)) * polar
         q = int(p)

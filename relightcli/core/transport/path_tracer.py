@@ -2,7 +2,7 @@
 
 At every surface point, up to K bounces deep, the light is estimated by `estimators`: by sampling the lights and by
 sampling the reflectance together. K bounces means K interreflections: layer k holds the light that was reflected k + 1
-times.
+times, but for layer 0, which has diffuse reflection alone; what specular lobes make of it is in layer K + 1.
 
 Samples come in independent passes of `samples_per_pass`, stratified within a pass; the spread of the passes gives the
 variance. Every random number hangs on (seed, pixel, pass, sample) alone, so the picture does not depend on how it was
@@ -33,7 +33,8 @@ BATCH = 1 << 16
 class Tile:
     """Sums over `passes` passes of what each pass measured, for some rows of the picture, float64.
 
-    layers (L, H, W, 3): radiance reflected 1 .. K + 1 times, then, with background, the environment seen directly
+    layers (L, H, W, 3): radiance reflected once, diffusely; 2 .. K + 1 times; once, by specular lobes; then, with
+    background, the environment seen directly
     squares (H, W, 3): of the passes' beauty; alpha (H, W): of the passes' coverage; rays: how many were traced
     Tiles of further passes of the same rows add up (`+`).
     """
@@ -112,7 +113,7 @@ def trace_rows(
     """
     film = make_film(camera)
     first, count = rows[0] * film.width, (rows[1] - rows[0]) * film.width
-    layers = np.zeros((bounces + 1 + background, count, 3))
+    layers = np.zeros((bounces + 2 + background, count, 3))
     squares = np.zeros((count, 3))
     alpha = np.zeros(count)
     chunk = max(1, BATCH // samples_per_pass)
@@ -165,7 +166,8 @@ def _trace_paths(
     hits = tracer.intersect(origins, direction.astype(np.float32))
     rays = n
     covered = hits.face >= 0
-    values = np.zeros((n, bounces + 1 + background, 3))
+    values = np.zeros((n, bounces + 2 + background, 3))
+    lobes, shares, none = bounces + 1, np.zeros((n, 3)), np.zeros((0, 3))
     if background:
         estimators.add_background(environment, hits.face, direction, values)
     surface = surface_at(scene, hits.face, hits.u, hits.v, direction, np.ones((n, 3)), np.arange(n))
@@ -177,26 +179,29 @@ def _trace_paths(
             break
         front = tracer.offset(surface.position, surface.geometric)
         back = tracer.offset(surface.position, -surface.geometric) if two_origins else front
+        known, wanted = (none, shares) if k == 0 else (shares, none)
         if environment.density > 0.0:
-            source, below, direction, gain = estimators.sample_environment(
-                scene, environment, surface, keys, paths.samples, 3 * k + 1
+            source, below, direction, gain, share = estimators.sample_environment(
+                scene, environment, surface, keys, paths.samples, 3 * k + 1, known
             )
             blocked = tracer.occluded(_origins(front, back, source, below), direction.astype(np.float32))
-            estimators.add_light(values, k, surface.path, source, gain, blocked)
+            estimators.add_light(values, k, lobes, surface.path, source, gain, blocked, share)
             rays += len(source)
         if lit_by_lights:
-            source, below, target, gain = estimators.sample_lights(scene, surface, keys, paths.samples, 3 * k + 2)
+            source, below, target, gain, share = estimators.sample_lights(
+                scene, surface, keys, paths.samples, 3 * k + 2, known
+            )
             origins = _origins(front, back, source, below)
             reach = np.full(len(source), 1.0 - LIGHT_CLEARANCE, np.float32)
             blocked = tracer.occluded(origins, tracer.to_local(target) - origins, reach)
-            estimators.add_light(values, k, surface.path, source, gain, blocked)
+            estimators.add_light(values, k, lobes, surface.path, source, gain, blocked, share)
             rays += len(source)
 
         last = k == bounces
         if last and not (environment.lit or lit_by_lights):
             break
         source, below, direction, throughput, density = estimators.sample_reflection(
-            scene, surface, keys, paths.samples, 3 * k + 3
+            scene, surface, keys, paths.samples, 3 * k + 3, wanted
         )
         origins = _origins(front, back, source, below)
         toward = direction.astype(np.float32)
@@ -204,19 +209,22 @@ def _trace_paths(
         if last and not lit_by_lights:
             face = np.where(tracer.occluded(origins, toward), 0, -1).astype(np.int32)
             estimators.add_found_environment(
-                values, k, surface.path, source, environment, face, direction, throughput, density
+                values, k, lobes, shares, surface.path, source, environment, face, direction, throughput, density
             )
             break
         hits = tracer.intersect(origins, toward)
         if environment.lit:
             estimators.add_found_environment(
-                values, k, surface.path, source, environment, hits.face, direction, throughput, density
+                values, k, lobes, shares, surface.path, source, environment, hits.face, direction, throughput, density
             )
         if lit_by_lights:
             free = np.where(hits.face >= 0, hits.distance.astype(np.float64) / tracer.scale, np.inf)
-            estimators.add_found_lights(values, k, scene, surface, source, free, direction, throughput, density)
+            estimators.add_found_lights(
+                values, k, lobes, shares, scene, surface, source, free, direction, throughput, density
+            )
         if not last:
             surface = surface_at(scene, hits.face, hits.u, hits.v, direction, throughput, surface.path[source])
+        shares[:] = 0.0
     return values, covered, rays
 
 

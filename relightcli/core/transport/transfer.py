@@ -13,7 +13,7 @@ factors towards x (`brdf.transport_basis`): no BRDF is evaluated per pair of dir
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -24,6 +24,7 @@ from relightcli.core.shade.gather import Gather, in_parts
 from relightcli.core.shade.lobe_factors import FAST, axes_of, waves
 from relightcli.core.sphere import cube, sh
 
+RIDGE = 1e-3  # of `light_fit`: below a tenth it changes little
 DIFFUSE, THROUGH, SPECULAR = 0, 1, 2  # parts of a surface: reflected, let through from the other side, specular + p
 ORDERS = np.array([m for row in ROWS for m in range(row)])  # azimuthal order of the light factors
 
@@ -237,6 +238,22 @@ def light_factor_projections(light_factor: NDArray[np.float32], order: int) -> N
             if m:
                 out[k, 1, band * (band + 1) - m] = azimuth * integral
     return out
+
+
+def light_fit(even: NDArray[np.floating[Any]]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """What turns a sky's direct light into lights that bounce alike: fit (L, S), keep (L, L) float32.
+
+    The lights are few and broad; the mean radiance of a sky over each, c0 (L,), has a low sun shine from all of a cell.
+    Instead they are matched by what they do first, at S receivers: c = c0 + F (E - M c0), with M = `even` (S, L) the
+    irradiance over pi under each light, E (S,) that under the sky, and F = (M'M + RIDGE trace(M'M) / L)^-1 M' the
+    least squares solution near c0. As c = F E + (1 - F M) c0: fit = F, keep = 1 - F M.
+    """
+    m = np.asarray(even, np.float64)
+    gram = m.T @ m
+    count = len(gram)
+    ridge = max(RIDGE * float(np.trace(gram)) / count, 1e-30)
+    fit = np.linalg.solve(gram + ridge * np.eye(count), m.T)
+    return fit.astype(np.float32), (np.eye(count) - fit @ m).astype(np.float32)
 
 
 def even_projection(order: int) -> NDArray[np.float64]:

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from relightcli.core.compress import tucker
-from relightcli.core.compress.tucker import gram_spectrum, hooi, hosvd, mode_gram, mode_product, pair_safe_rank
+from relightcli.core.compress.tucker import (
+    gram_spectrum,
+    hooi,
+    hosvd,
+    mode_gram,
+    mode_product,
+    pair_safe_rank,
+    sequential_hosvd,
+)
 from relightcli.core.compress.tucker import reconstruct as rebuilt
 from relightcli.errors import NumericalError
 
@@ -224,3 +232,32 @@ def test_a_rank_that_would_cut_a_pair_is_moved_up(rank):
 def test_cutting_a_pair_would_be_seen():
     near = rebuilt(hooi(circulant_tensor(), (2, 4, 4)))
     assert np.abs(np.roll(near, (1, 1), (1, 2)) - near).max() > 1e-3 * np.abs(near).max()
+
+
+@pytest.mark.parametrize("ranks", [(8, None, 6), (5, 7, 4), (20, None, None)])
+def test_sequential_is_near_the_optimum(ranks):
+    # Singular values that fall off slowly, as those of transport do.
+    rng = np.random.default_rng(3)
+    x = rng.standard_normal((60, 20, 30)).astype(np.float32)
+    for mode, size in enumerate(x.shape):
+        x = np.moveaxis(np.moveaxis(x, mode, -1) * np.arange(1, size + 1) ** -1.0, -1, mode)
+    found, best = sequential_hosvd(x, ranks), hooi(x, ranks)
+    assert found.error2 <= 1.02 * best.error2
+    back = rebuilt(found)
+    assert ((x - back) ** 2).sum() == pytest.approx(found.error2, rel=1e-4)
+    for factor, rank in zip(found.factors, ranks, strict=True):
+        if rank is None:
+            assert factor is None
+        else:
+            np.testing.assert_allclose(factor.T @ factor, np.eye(rank), atol=1e-12)
+
+
+def test_sequential_takes_no_more_rank_than_there_is():
+    rng = np.random.default_rng(4)
+    x = np.einsum("ai,bi,ci->abc", *(rng.standard_normal((n, 3)) for n in (40, 6, 9))).astype(np.float32)
+    found = sequential_hosvd(x, (200, None, 200))
+    assert found.error2 <= 1e-10 * found.norm2
+    zero = sequential_hosvd(np.zeros((5, 4, 3), np.float32), (2, None, 2))
+    assert zero.error2 == 0.0
+    with pytest.raises(ValueError, match="three ranks"):
+        sequential_hosvd(x, (0, None, 1))
