@@ -11,7 +11,7 @@ from relightcli.scene.model import Camera, Material
 from relightcli.stages import cluster, factorize
 from relightcli.stages.lighting import LightingStore
 from relightcli.stages.transfer_setup import TransferSetup, coarse_cells
-from tests.core.transport.scenes import Part, lambert, sphere, square
+from tests.core.transport.scenes import Part, lambert, sphere
 from tests.core.transport.test_buried import grid
 from tests.stages.scene_files import make_store, write_scene
 from tests.stages.test_asset import ground, layers_of
