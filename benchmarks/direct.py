@@ -24,7 +24,6 @@ F0 = (0.04, 0.8)
 KEEP = (32, 96, 256)
 RECEIVERS = 36_000
 EYE = (1.6, 1.7, 3.4)
-# Lobes beside the paper's four.
 
 
 def knot_on_ground(along: int, sides: int) -> tuple[Any, Any, Any]:

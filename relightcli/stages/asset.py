@@ -52,7 +52,7 @@ class AssetStore(LightingStore):
         self._tensors: _Tensors | None = None
         self._direct_store: DirectTensors | None = None
         self._direct_sky: SkyCube | None = None
-        self._lit: tuple[NDArray[np.float32], float, SkyCube] | None = None
+        self._lit: tuple[NDArray[np.float32], float, SkyCube, SkyCube] | None = None
         self._coated: tuple[dict[str, Material], _Coats] | None = None
         self._diffuse: dict[int, tuple[Factors, _Coats, Factors]] = {}
 
@@ -75,17 +75,17 @@ class AssetStore(LightingStore):
         if basis is None:
             if coats.shiny.any() and view is None:
                 raise InputError("a material with a specular lobe looks different from everywhere: name a --camera")
-            sky = self._sky_of(environment, rotate)
-            parts = [self._direct_tensors(sky, environment, rotate, coats, view, active)]
+            sky, spread = self._sky_of(environment, rotate)
+            parts = [self._direct_tensors(sky, spread, environment, rotate, coats, view, active)]
         else:
             parts = super().exit_radiance(environment, rotate, materials, view, active, basis, 0)
-            sky = self._sky_of(environment, rotate)
+            sky, spread = self._sky_of(environment, rotate)
         if bounces == 0:
             return parts
         if self._tensors is None:
             self._tensors = _Tensors(self)
         tensors = self._tensors
-        tensors.set_light(sky)
+        tensors.set_light(sky, spread)
         tensors.set_materials(coefficients(self.channels, coats.table, self.functions))
         shines = bool(coats.shiny.any()) and view is not None
         specular = self._specular(coats, view, active) if shines else [None] * len(tensors.even)
@@ -114,14 +114,17 @@ class AssetStore(LightingStore):
             kept = self._diffuse[part] = (even, coats, coats.diffuse(even * np.float32(np.pi)))
         return kept[2]
 
-    def _sky_of(self, environment: NDArray[np.float32], rotate: float) -> SkyCube:
+    def _sky_of(self, environment: NDArray[np.float32], rotate: float) -> tuple[SkyCube, SkyCube]:
+        """The sky, and the same spread over neighbouring texels (`environment.splat`)."""
         if self._lit is None or self._lit[0] is not environment or self._lit[1] != rotate:
-            self._lit = (environment, rotate, latlong_to_cube(environment, self.resolution, rotate))
-        return self._lit[2]
+            sky = latlong_to_cube(environment, self.resolution, rotate)
+            self._lit = (environment, rotate, sky, splat(sky))
+        return self._lit[2:]
 
     def _direct_tensors(
         self,
         sky: SkyCube,
+        spread: SkyCube,
         environment: NDArray[np.float32],
         rotate: float,
         coats: _Coats,
@@ -133,7 +136,7 @@ class AssetStore(LightingStore):
             self._direct_store = DirectTensors(self)
         direct = self._direct_store
         if self._direct_sky is not sky:
-            direct.set_light(sky)
+            direct.set_light(spread)
             self._direct_sky = sky
         lamp_e, lamps = self._lamps(coats, view, active)
         if lamp_e is None:
@@ -234,12 +237,12 @@ class _Tensors:
             (read(f"{name}/fit"), read(f"{name}/keep")) for name in ("one_bounce", "two_bounce")[: asset.bounces]
         ]
 
-    def set_light(self, sky: SkyCube) -> None:
+    def set_light(self, sky: SkyCube, spread: SkyCube) -> None:
         if self._sky is sky:
             return
         self._sky, self._weights = sky, None
         lamps = np.eye(3, dtype=np.float32)[: self.asset.lamps]
-        incident = irradiance(self._fit_bits, self._fit_normal, moment_prefix(splat(sky))) / np.float32(np.pi)
+        incident = irradiance(self._fit_bits, self._fit_normal, moment_prefix(spread)) / np.float32(np.pi)
 
         def matched(bounce: int, mean: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
             fit, keep = self._fit[bounce]

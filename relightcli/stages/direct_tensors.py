@@ -25,7 +25,7 @@ from relightcli.core.brdf.direct_model import (
 from relightcli.core.brdf.disc import RESOLUTION
 from relightcli.core.brdf.models import F0, ROUGHNESS, SHININESS, MaterialTable, widen
 from relightcli.core.brdf.models import SPECULAR as SPECULAR_COLUMN
-from relightcli.core.lights.environment import SkyCube, splat
+from relightcli.core.lights.environment import SkyCube
 from relightcli.core.lights.prefiltered import prefiltered_sky
 from relightcli.core.shade.bright import Bright, add_highlights, add_irradiance, split_bright
 from relightcli.core.transport.direct_tensor import direct_light, direct_transfer, light_coefficients, shade_direct
@@ -112,9 +112,12 @@ class DirectTensors:
         self.bright: Bright
 
     def set_light(self, sky: SkyCube) -> None:
-        """`even` (N, 3) becomes the irradiance over pi; the lobes get their skies, the brightest texels apart."""
+        """`even` (N, 3) becomes the irradiance over pi; the lobes get their skies, the brightest texels apart.
+
+        sky: after `environment.splat`.
+        """
         lighting = self.lighting
-        rest, self.bright = split_bright(splat(sky))
+        rest, self.bright = split_bright(sky)
         light = light_coefficients(rest.radiance())
         self.even = np.zeros_like(self.even)  # a new array: what was made of the old one is told by it
         for group in self.groups:

@@ -48,7 +48,7 @@ def coarse_cells() -> NDArray[np.float32]:
 def cell_radiance(flux: NDArray[np.float64], resolution: int, cells: int) -> NDArray[np.float64]:
     """Mean radiance (6 C C, 3) of a sky's coarse cells from the flux (6 R R, 3) of its texels."""
     side = resolution // cells
-    total = flux.reshape(6, cells, side, cells, side, 3).sum(axis=(2, 4)).reshape(-1, 3)
+    total = cube.block_sums(flux, resolution, side)
     solid = np.tile(cube.solid_angles(resolution).reshape(cells, side, cells, side).sum(axis=(1, 3)), (6, 1, 1))
     radiance: NDArray[np.float64] = total / solid.reshape(-1, 1)
     return radiance

@@ -50,8 +50,7 @@ def _corners(sky: SkyCube) -> NDArray[np.float32]:
     around, share = _meeting_texels(sky.resolution)
     radiance = (sky.flux / np.tile(cube.solid_angles(sky.resolution).reshape(-1), 6)[:, None]).astype(np.float32)
     out = np.zeros((len(around), 4), np.float32)
-    for k in range(8):
-        out[:, :3] += share[:, k, None] * radiance[around[:, k]]
+    _meet(around, share, radiance, out)
     r = sky.resolution
     return out.reshape(6, r + 1, r + 1, 4)
 
@@ -84,8 +83,8 @@ class _Plan(NamedTuple):
 def _gaussian(sky: SkyCube, degrees: float, threads: int) -> NDArray[np.float32]:
     plan = _plan(sky.resolution, degrees, threads)
     source, shrink = plan.source, sky.resolution // plan.source
-    flux = sky.flux.reshape(6, source, shrink, source, shrink, 3).sum(axis=(2, 4)).reshape(-1, 3)
-    moment = sky.moment.sum(axis=1).reshape(6, source, shrink, source, shrink, 3).sum(axis=(2, 4)).reshape(-1, 3)
+    flux = cube.block_sums(sky.flux, sky.resolution, shrink)
+    moment = cube.block_sums(sky.moment.sum(axis=1), sky.resolution, shrink)
     length = np.sqrt((moment**2).sum(1, keepdims=True))
     center = cube.texel_directions(source).reshape(-1, 3)
     away = np.where(length > 0.0, moment / np.where(length > 0.0, length, 1.0) - center, 0.0)
@@ -143,6 +142,14 @@ def _nodes(n: int) -> NDArray[np.float64]:
     """Directions (6, n+1, n+1, 3) of the corners of n x n texels per face."""
     edge = 2.0 * np.arange(n + 1) / n - 1.0
     return np.stack([cube.face_directions(face, edge[None, :], edge[:, None]) for face in range(6)])
+
+
+@njit(cache=True, nogil=True)
+def _meet(around, share, radiance, out):  # type: ignore[no-untyped-def]
+    for m in range(len(around)):
+        for k in range(8):
+            for c in range(3):
+                out[m, c] += share[m, k] * radiance[around[m, k], c]
 
 
 @njit(cache=True, nogil=True)

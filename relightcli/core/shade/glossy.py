@@ -64,11 +64,11 @@ class SkyTree:
 
 def sky_tree(sky: SkyCube, radiance: NDArray[np.float32], rotate_degrees: float) -> SkyTree:
     """The quadtree of a sky cube, and the lat-long map (H, W, 3) with its turn that the cube was made from."""
-    levels = []
+    levels, mean = [], sky.moment.sum(axis=1)
     for shrink in (8, 4, 2, 1):
         r = sky.resolution // shrink
-        flux = sky.flux.reshape(6, r, shrink, r, shrink, 3).sum(axis=(2, 4)).reshape(-1, 3)
-        moment = sky.moment.sum(axis=1).reshape(6, r, shrink, r, shrink, 3).sum(axis=(2, 4)).reshape(-1, 3)
+        flux = cube.block_sums(sky.flux, sky.resolution, shrink)
+        moment = cube.block_sums(mean, sky.resolution, shrink)
         center = cube.texel_directions(r).reshape(-1, 3)
         length = np.linalg.norm(moment, axis=1, keepdims=True)
         direction = np.where(length > 0, moment / np.maximum(length, 1e-300), center)

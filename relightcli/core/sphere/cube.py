@@ -64,6 +64,16 @@ def texel_index(directions: NDArray[np.floating], resolution: int) -> NDArray[np
     return (face * resolution + row) * resolution + column
 
 
+def block_sums(values: NDArray[np.float64], resolution: int, shrink: int) -> NDArray[np.float64]:
+    """Sums of texel values (6 R R, k) over squares of `shrink` texels a side, a power of two: (6 (R/shrink)^2, k)."""
+    found = values.reshape(6, resolution, resolution, -1)
+    while shrink > 1:
+        found = found[:, ::2] + found[:, 1::2]
+        found = found[:, :, ::2] + found[:, :, 1::2]
+        shrink //= 2
+    return found.reshape(-1, values.shape[1])
+
+
 def neighbours(resolution: int) -> NDArray[np.int32]:
     """The up to eight neighbours of every texel, across face borders too: (6 R R, 8) int32.
 

@@ -111,3 +111,10 @@ def test_neighbours_are_near_and_mutual(resolution):
     corner = np.zeros((6, resolution, resolution), bool)
     corner[:, :: resolution - 1, :: resolution - 1] = True
     np.testing.assert_array_equal(distinct, np.where(corner.reshape(-1), 7, 8) if resolution > 2 else distinct)
+
+
+def test_block_sums():
+    values = np.random.default_rng(0).random((6 * 16 * 16, 2))
+    expected = values.reshape(6, 4, 4, 4, 4, 2).sum((2, 4)).reshape(-1, 2)
+    np.testing.assert_allclose(cube.block_sums(values, 16, 4), expected)
+    np.testing.assert_array_equal(cube.block_sums(values, 16, 1), values)
