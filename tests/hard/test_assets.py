@@ -49,8 +49,8 @@ def stores(tmp_path_factory):
     options = {"light_resolution": 32, "bounce_resolution": 8, "subdivide": False, "workers": 2}
     transfer = make_store(scene, bounces=2, **options)
     clusters, asset = folder / "clusters.zarr", folder / "asset.zarr"
-    cluster.cluster(cluster.Config(transfer, clusters, 3, workers=2))
-    said = factorize.factorize(factorize.Config(clusters, asset, 4096, 4096, workers=2))
+    cluster.cluster(cluster.Config(transfer, clusters, 8, functions=2, workers=2))
+    said = factorize.factorize(factorize.Config(clusters, asset, 1024, 1024, workers=2))
     return transfer, asset, said
 
 
