@@ -83,7 +83,7 @@ def test_extremes_are_bounded_and_near_the_transfer_store(stores, edit, env, cam
         # No more than a white world would send: the brightest of the sky.
         assert b[name].max() <= (1.05 if env == "even" else 5.0), name
     if env == "horizon":
-        # 96 Haar coefficients are spent on light from above: at grazing light direct tensors are half again too bright.
+        # 96 Haar coefficients are spent on light from above: at grazing light direct tensors are too bright.
         b = layers_of(asset, "b.exr", env=env, camera=camera, settings=edit, basis="visibility")
     assert b[""].mean() == pytest.approx(a[""].mean(), rel=0.1)
 

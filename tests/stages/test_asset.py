@@ -108,7 +108,7 @@ def test_direct_light_from_tensors(transfer, asset, edit, env):
     )
     if (edit, env) != (SHARP, "sunny"):  # a sun's mirror image is as wide as a texel
         assert relative_rmse(b, a) < 0.05
-    np.testing.assert_allclose(b.mean((0, 1)), a.mean((0, 1)), rtol=0.1 if edit == SHARP else 0.02)
+    np.testing.assert_allclose(b.mean((0, 1)), a.mean((0, 1)), rtol=0.1 if (edit, env) == (SHARP, "sunny") else 0.02)
 
 
 def test_tensors_carry_the_energy_of_matte_surfaces(transfer):
@@ -133,13 +133,20 @@ def test_tensors_carry_the_energy_of_matte_surfaces(transfer):
     np.testing.assert_allclose(got.mean(0), truth[2].diffuse[rows].mean(0), rtol=0.02)
 
 
-def test_error_falls_with_rank_and_is_what_was_recorded(clusters, tmp_path):
+def recorded(asset, bounce):
+    """Relative RMS that an asset's blocks say was left out."""
+    blocks = [b for b in formats.open_store(asset).blocks if b["id"].startswith(bounce.replace("_", "-"))]
+    return (sum(b["error2"] for b in blocks) / sum(b["norm2"] for b in blocks)) ** 0.5
+
+
+def test_error_falls_with_rank_and_is_what_was_recorded(clusters, asset, tmp_path):
     left = {}
     for v, rank in ((4, 8), (64, 256)):
         config = factorize.Config(clusters, tmp_path / f"{v}.zarr", v, rank, workers=2)
         left[v] = factorize.factorize(config)["errors"]
     for bounce in ("one_bounce", "two_bounce"):
-        assert left[4][bounce]["total"] > 1.2 * left[64][bounce]["total"]
+        totals = [left[4][bounce]["total"], recorded(asset, bounce), left[64][bounce]["total"]]
+        assert totals[0] > totals[1] > totals[2]
         assert all(e[bounce]["total"] >= e[bounce]["compression"] * (1 - 1e-6) for e in left.values())
     assert left[64]["two_bounce"]["total"] < 0.01
 

@@ -14,6 +14,7 @@ from relightcli.core.brdf.albedo import directional_albedo, lobe_share
 from relightcli.core.brdf.dataset import cook_torrance_set
 from relightcli.core.brdf.disc import disc_grid
 from relightcli.core.brdf.models import evaluate_many, pack_materials
+from relightcli.core.brdf.specular_lobes import LOBES
 from relightcli.errors import InputError
 from tests.core.shade.skies import shiny
 
@@ -104,11 +105,11 @@ def test_isotropic(model):
 def test_weights_by_norm_help_rough_materials():
     points = np.array([(1.0, m) for m in np.geomspace(0.05, 1.0, 10)])
     plain, weighted = (
-        dm.build_direct_model("cook-torrance", points, (3, 8, 8), resolution=16, weighted=w) for w in (False, True)
+        dm.build_direct_model("cook-torrance", points, (3, 8, 8), LOBES, 16, weighted=w) for w in (False, True)
     )
     rough = points[:, 1] > 0.4
-    # Measured 0.27 and 0.25; it was 0.29 and 0.22 while wide lobes were left to the tensor.
-    assert np.median(weighted.error[rough]) < 0.95 * np.median(plain.error[rough])
+    # Measured 0.34 and 0.24 with the paper's lobes. The wide one leaves the tensor less to weigh: 0.27 and 0.25.
+    assert np.median(weighted.error[rough]) < 0.9 * np.median(plain.error[rough])
 
 
 def test_ranks_beyond_the_data():
