@@ -192,7 +192,7 @@ def _two_bounces(
             "core": ((rank, size), ("eigenvector", "channels_harmonic_light"), (1,)),
         },
         clusters,
-        {"receiver_factor": "int8"},
+        {},
         {},
     )
     todo = [c for c in range(clusters) if f"two-bounce/{c}" not in writer.done]
