@@ -41,8 +41,10 @@ class Tracer:
         from embreex import rtcore_scene
         from embreex.mesh_construction import TriangleMesh
 
-        used = positions[np.unique(faces)] if len(faces) else np.zeros((1, 3))
-        low, high = used.min(axis=0), used.max(axis=0)
+        used = np.zeros(len(positions), bool)
+        used[faces] = True
+        corners = positions[used] if len(faces) else np.zeros((1, 3))
+        low, high = corners.min(axis=0), corners.max(axis=0)
         self.center: NDArray[np.float64] = 0.5 * (low + high)
         half = float(np.max(high - low)) * 0.5
         self.scale: float = 2.0 ** -math.ceil(math.log2(half)) if half > 0 else 1.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import logging
 import os
@@ -51,8 +52,17 @@ def group() -> None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Entry point. Exit codes are those of interface.md: 0, 1 (diff), 2, 3, 4, 5, 130."""
-    sys.exit(run(sys.argv[1:] if arguments is None else arguments))
+    """Entry point. Exit codes are those of interface.md: 0, 1 (diff), 2, 3, 4, 5, 130.
+
+    Ends the process without taking the interpreter down module by module, which costs a third of a second after a
+    picture: what the exit handlers do is done, files are closed, the rest is memory.
+    """
+    code = run(sys.argv[1:] if arguments is None else arguments)
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(code)
 
 
 def run(arguments: list[str]) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -113,10 +114,10 @@ class LightingStore:
         self.pixels = self.store.layouts["receivers/pixel"].shape[0] if "receivers/pixel" in self.store else 0
         self._gathered: dict[int, Gather] = {}
         self._seen: list[tuple[int, Gather]] | None = None
-        self._bits: NDArray[np.uint8] | None = None
+        self._bits: Future[NDArray[np.uint8]] | None = None
         layout = self.store.layouts["visibility/bits"]
-        if layout.raw_bytes <= IN_MEMORY:
-            self._bits = read("visibility/bits")
+        if layout.raw_bytes <= IN_MEMORY:  # decoded beside the making of the first view
+            self._bits = ThreadPoolExecutor(1).submit(read, "visibility/bits")
         self._chunk = layout.chunks[0]
 
     def __len__(self) -> int:
@@ -147,7 +148,7 @@ class LightingStore:
         chunk by chunk."""
         last = len(self) if last is None else last
         if self._bits is not None:
-            yield slice(first, last), self._bits[first:last]
+            yield slice(first, last), self._bits.result()[first:last]
             return
         array: Any = self.store.array("visibility/bits")
         for start in range(first - first % self._chunk, last, self._chunk):

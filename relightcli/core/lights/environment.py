@@ -88,10 +88,11 @@ def _strip_meridians(resolution: int) -> NDArray[np.float64]:
     keep = (i != 0) | (j != 0)
     i, j = i[keep], j[keep]
     g = np.gcd(i, j)
-    corners = np.unique(np.stack([i // g, j // g], axis=1), axis=0)
+    once = g <= 2  # every direction's nearest corner: odd ones have g = 1, even ones 2
+    corners = np.arctan2(i[once].astype(np.float64), j[once].astype(np.float64))
     steps = STRIPS * resolution
     even = -math.pi + (2.0 * math.pi / steps) * np.arange(steps)
-    return np.concatenate([np.arctan2(corners[:, 0].astype(np.float64), corners[:, 1].astype(np.float64)), even])
+    return np.concatenate([corners, even])
 
 
 @lru_cache(maxsize=1)
