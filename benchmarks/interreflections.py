@@ -23,7 +23,11 @@ LAYERS = ("", "direct", "specular", "one_bounce", "two_bounce")
 LIMIT = {False: 3.0, True: 6.0}  # %, diffuse and glossy scenes
 FLIP_LIMIT = 0.05
 REPEATS = 3
-RECEIVERS = {"vertices": "vertices", "pixels": "pixels:main"}
+RECEIVERS = {
+    "vertices": (),
+    "pixels": ("--receivers", "pixels:main"),
+    "pixels, 2 x 2": ("--receivers", "pixels:main", "--pixel-grid", "2"),
+}
 Picture = dict[str, NDArray[np.float32]]
 
 
@@ -71,8 +75,8 @@ def measure(setting: Setting) -> Report:
         path = write(scene, folder, size)
         stores, made = {}, {}
         for receivers, asked in RECEIVERS.items():
-            stores[receivers] = store = folder / f"{receivers}.zarr"
-            more = ("--receivers", asked, "--bounces", str(BOUNCES), *setting.options)
+            stores[receivers] = store = folder / f"{len(stores)}.zarr"
+            more = (*asked, "--bounces", str(BOUNCES), *setting.options)
             _, made[receivers] = run_tool("precompute", path, "-o", store, *more)
         edit = [word for change in scene.edit for word in ("--set", change)]
         for sky, environment in maps.items():
@@ -83,7 +87,7 @@ def measure(setting: Setting) -> Report:
                 run_tool("relight", stores["vertices"], *common, "-o", output, *more)
             a, b = (read(p) for p in references)
             for receivers, store in stores.items():
-                output = folder / f"{sky}-{receivers}.exr"
+                output = store.with_name(f"{sky}-{store.stem}.exr")
                 run_tool("relight", store, *common, "-o", output)
                 ours = read(output)
                 found = [error(ours[name], a[name], b[name]) for name in LAYERS]

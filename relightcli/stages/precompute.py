@@ -27,6 +27,7 @@ from relightcli.scene.model import Geometry, Scene
 from relightcli.scene.parse import load_scene
 from relightcli.stages.inputs import scene_inputs
 from relightcli.stages.receiver_setup import (
+    MOST_PIXEL_GRID,
     PixelReceivers,
     check_receivers,
     make_receivers,
@@ -58,6 +59,7 @@ class Config:
     refine: int = 4
     effects: str = "auto"
     receivers: str = "vertices"
+    pixel_grid: int = 1
     subdivide: bool = True
     basis: str = "visibility"
     coefficients: int = 128
@@ -111,6 +113,8 @@ def precompute(config: Config) -> dict[str, Any]:
         "seed": config.seed,
         "bounces": bounces,
     }
+    if config.receivers != "vertices":
+        settings["pixel_grid"] = config.pixel_grid
     if bounce_cells:
         settings["bounce_resolution"] = bounce_cells
     if config.basis == "haar":
@@ -190,6 +194,10 @@ def _check(config: Config) -> None:
         raise InputError(f"--tolerance: expected more than 0 and less than 1; found {config.tolerance}")
     if not 1 <= config.sh_order <= 16:
         raise InputError(f"--sh-order: expected 1 to 16; found {config.sh_order}")
+    if not 1 <= config.pixel_grid <= MOST_PIXEL_GRID:
+        raise InputError(f"--pixel-grid: expected 1 to {MOST_PIXEL_GRID}; found {config.pixel_grid}")
+    if config.pixel_grid != 1 and config.receivers == "vertices":
+        raise InputError("--pixel-grid: needs --receivers pixels:CAMERA")
     if config.bounces is not None and not 0 <= config.bounces <= MOST_BOUNCES:
         raise InputError(f"--bounces: expected 0 to {MOST_BOUNCES}; found {config.bounces}")
 
@@ -226,7 +234,7 @@ def _receivers(
     Pixels look at the uncut `source`: they are the same, and lit the same, with and without interreflections.
     """
     seen = geometry if config.receivers == "vertices" else source
-    asked = make_receivers(config.receivers, scene, seen, both, fine=bounces)
+    asked = make_receivers(config.receivers, scene, seen, both, config.pixel_grid, fine=bounces)
     if isinstance(asked, PixelReceivers) and not bounces:
         return asked, None
     vertices = on_vertices(geometry, both) if isinstance(asked, PixelReceivers) else asked

@@ -24,7 +24,8 @@ from relightcli.core.transport.shading import vertex_colours
 from relightcli.errors import InputError
 from relightcli.scene.model import Geometry, Scene
 
-PIXEL_GRIDS = (1, 3)  # samples along a pixel's side, inside and at edges, for pixel receivers
+PIXEL_EDGE_GRID = 3  # the least samples along a pixel's side at the edges of a picture, for pixel receivers
+MOST_PIXEL_GRID = 4
 
 
 @dataclass(frozen=True)
@@ -64,13 +65,16 @@ def check_receivers(asked: str, scene: Scene, geometry: Geometry) -> None:
 
 
 def make_receivers(
-    asked: str, scene: Scene, geometry: Geometry, both: NDArray[np.bool_], fine: bool = False
+    asked: str, scene: Scene, geometry: Geometry, both: NDArray[np.bool_], grid: int = 1, fine: bool = False
 ) -> Receivers | PixelReceivers:
-    """The receivers that `--receivers` asks for, once checked. `both` (O,): objects lit from both sides; fine: outlines
-    and textures of pixels as finely as vertices have them."""
+    """The receivers that `--receivers` asks for, once checked.
+
+    both (O,): objects lit from both sides; grid: receivers along a pixel's side; fine: outlines and textures of pixels
+    as finely as vertices have them.
+    """
     if asked == "vertices":
         return on_vertices(geometry, both)
-    return _pixel_receivers(scene, asked.partition(":")[2], geometry, fine)
+    return _pixel_receivers(scene, asked.partition(":")[2], geometry, grid, fine)
 
 
 def on_vertices(geometry: Geometry, both: NDArray[np.bool_]) -> Receivers:
@@ -83,11 +87,11 @@ def with_vertices(pixels: PixelReceivers, vertices: Receivers) -> PixelReceivers
     return replace(pixels, points=join_receivers(pixels.points, vertices))
 
 
-def _pixel_receivers(scene: Scene, name: str, geometry: Geometry, fine: bool) -> PixelReceivers:
+def _pixel_receivers(scene: Scene, name: str, geometry: Geometry, grid: int, fine: bool) -> PixelReceivers:
     film = make_film(scene.cameras[name])
     tracer = Tracer(geometry.positions, geometry.faces)
     normals = primary.face_normals(geometry.positions, geometry.faces)
-    samples = primary.see(tracer, film, geometry.face_object, normals, *PIXEL_GRIDS)
+    samples = primary.see(tracer, film, geometry.face_object, normals, grid, max(grid, PIXEL_EDGE_GRID))
     seen = picture.lit_surface(geometry, samples)
     order = spatial_order(seen.position)
     sample = seen.path[order]
@@ -104,7 +108,7 @@ def _pixel_receivers(scene: Scene, name: str, geometry: Geometry, fine: bool) ->
     pixel, weight, texture = samples.pixel[sample], samples.weight[sample], seen.albedo[order].astype(np.float32)
     coverage = samples.coverage
     if fine:
-        base = primary.TEXTURE_GRID if geometry.textures else primary.BASE_GRID
+        base = grid * (primary.TEXTURE_GRID if geometry.textures else primary.BASE_GRID)  # a sample per receiver
         samples = primary.see(tracer, film, geometry.face_object, normals, base)
         finer = picture.lit_surface(geometry, samples)
         of_sample = geometry.face_object[samples.face]

@@ -9,6 +9,7 @@ import math
 import numpy as np
 import pytest
 
+import relight_formats as formats
 from relightcli.core.lights.latlong import texel_solid_angles
 from relightcli.scene.model import Camera, Material
 from tests.core.transport.scenes import Part, at_point, lambert, looking_down, sphere, sphere_grid, square
@@ -270,6 +271,29 @@ def test_pixel_receivers_agree_with_vertex_receivers(tmp_path):
     error = np.abs(by_vertex - by_pixel).max(axis=2) / by_pixel.max()
     assert np.median(error) < 3e-3
     assert np.quantile(error, 0.8) < 2e-2
+
+
+@pytest.mark.parametrize("bounces", [0, 1])
+def test_more_receivers_a_pixel_soften_the_steps_of_a_shadow(tmp_path, bounces):
+    # The sun's shadow of a ball: of one receiver a pixel it is all or nothing.
+    ball = sphere(0.5, (0, 0.6, 0), rings=24, material=lambert(0.8))
+    parts = {"ground": square(20, material=lambert(0.5)), "ball": ball}
+    camera = Camera("main", (0, 2, 3), (0, 0.2, 0), fov=40, size=(24, 24))
+    scene = write_scene(tmp_path, parts, [camera], {"sky": one_pixel_sky(14, 40, height=64) + 50})
+    truth = None
+    errors, counts = [], []
+    for grid in (1, 2, 4):
+        store = make_store(scene, f"{grid}.zarr", receivers="pixels:main", pixel_grid=grid, bounces=bounces)
+        if truth is None:
+            truth, _ = picture(store, "truth.exr", reference=True, spp=256)
+        rgb, alpha = picture(store, f"{grid}.exr")
+        assert alpha.min() > 0.999
+        errors.append(math.sqrt(((rgb - truth) ** 2).mean() / (truth**2).mean()))
+        counts.append(formats.open_store(store).layouts["receivers/pixel"].shape[0])
+    assert errors[1] < 0.6 * errors[0], errors
+    assert errors[2] < 0.6 * errors[1], errors
+    assert 2 * counts[0] < counts[1] < 4 * counts[0]  # outlines have nine already
+    assert counts[2] == 16 * 24 * 24
 
 
 def test_glossy_ball_under_a_constant_sky_shows_its_directional_albedo(tmp_path):

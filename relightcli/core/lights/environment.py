@@ -61,7 +61,7 @@ def latlong_to_cube(radiance: NDArray[np.float32], resolution: int, rotate_degre
     row_edges = np.cos(math.pi * np.arange(height + 1) / height)[::-1].copy()  # rising s, from the south pole
     row_half_angles = 0.5 * (np.arcsin(row_edges) + row_edges * np.sqrt(np.maximum(0.0, 1.0 - row_edges**2)))
     source = np.ascontiguousarray(radiance, np.float32)
-    table = _half_angles()
+    table = half_angles_table()
     parts = [np.zeros((6 * resolution * resolution, 3, 4)) for _ in range(2)]
     cut = len(column_of) // 2
     with ThreadPoolExecutor(2) as pool:
@@ -96,7 +96,7 @@ def _strip_meridians(resolution: int) -> NDArray[np.float64]:
 
 
 @lru_cache(maxsize=1)
-def _half_angles() -> NDArray[np.float64]:
+def half_angles_table() -> NDArray[np.float64]:
     """(atan x + x / (1 + x^2)) / 2 for x from 0 to 1.5, in steps so small that between them it is straight to 1e-8: the
     antiderivative of cos(latitude) = sqrt(1 - s^2) over s, at the latitude whose tangent is x."""
     x = np.linspace(0.0, 1.5, TABLE + 1)
@@ -104,7 +104,7 @@ def _half_angles() -> NDArray[np.float64]:
 
 
 @njit(cache=True, nogil=True)
-def _half_angle(table, x):  # type: ignore[no-untyped-def]
+def half_angle(table, x):  # type: ignore[no-untyped-def]
     place = abs(x) * (TABLE / 1.5)
     k = int(place)
     value = table[k] + (place - k) * (table[k + 1] - table[k])
@@ -113,53 +113,70 @@ def _half_angle(table, x):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _walk(radiance, column_of, borders, row_edges, row_half_angles, table, resolution, out):  # type: ignore[no-untyped-def]
-    height = len(row_edges) - 1
     edges = np.empty(6 * resolution + 8)
     half_angles = np.empty(6 * resolution + 8)
     texels = np.empty(6 * resolution + 8, np.int64)
-    total = np.empty((3, 3))  # of a texel, per colour: over s, over s times cos(latitude), over s^2 / 2
+    total = np.empty((3, 3))
+    rows = (0, len(row_edges) - 1)
     for strip in range(len(column_of)):
         low, high = borders[strip], borders[strip + 1]
         if high - low < 1e-14:
             continue
         middle = 0.5 * (low + high)
         count = _meridian(math.sin(middle), math.cos(middle), resolution, table, edges, half_angles, texels)
-        column = column_of[strip]
-        width = high - low
-        # integral of (sin, cos) of the longitude over the strip
-        wx = 2.0 * math.sin(middle) * math.sin(0.5 * width)
-        wz = 2.0 * math.cos(middle) * math.sin(0.5 * width)
-        s = -1.0
-        row, k = 0, 0
-        below = row_half_angles[0]
-        total[:] = 0.0
-        while row < height and k < count:
-            next_row, next_k = row, k
-            if row_edges[row + 1] <= edges[k + 1]:
-                top, above = row_edges[row + 1], row_half_angles[row + 1]
-                next_row += 1
-                if top == edges[k + 1]:
-                    next_k += 1
-            else:
-                top, above = edges[k + 1], half_angles[k + 1]
+        merge_strip(
+            radiance, column_of[strip], rows, row_edges, row_half_angles, edges, half_angles, texels, count,
+            middle, high - low, total, out,
+        )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def merge_strip(  # type: ignore[no-untyped-def]
+    radiance, column, rows, row_edges, row_half_angles, edges, half_angles, places, count, middle, width, total, out
+):
+    """Adds the light of a column's pixels, in a strip of `width` radians about the longitude `middle`, to the places
+    that the meridian meets.
+
+    Rows are counted from the south pole; those from rows[0] to rows[1] take part. row_edges (H + 1,): s = sin(latitude)
+    of their borders; edges: the same of the `count` places; half_angles: antiderivatives of cos(latitude) over s there.
+    out (P, 3, 4): per place and colour the flux and the moment. total: room, (3, 3).
+    """
+    height = len(row_edges) - 1
+    # integral of (sin, cos) of the longitude over the strip
+    wx = 2.0 * math.sin(middle) * math.sin(0.5 * width)
+    wz = 2.0 * math.cos(middle) * math.sin(0.5 * width)
+    row, k = rows[0], 0
+    s, below = row_edges[row], row_half_angles[row]
+    while k + 1 < count and edges[k + 1] <= s:
+        k += 1
+    total[:] = 0.0  # of a place, per colour: over s, over s times cos(latitude), over s^2 / 2
+    while row < rows[1] and k < count:
+        next_row, next_k = row, k
+        if row_edges[row + 1] <= edges[k + 1]:
+            top, above = row_edges[row + 1], row_half_angles[row + 1]
+            next_row += 1
+            if top == edges[k + 1]:
                 next_k += 1
-            if top > s:
-                area, across, level = top - s, above - below, 0.5 * (top * top - s * s)
-                for c in range(3):
-                    value = np.float64(radiance[height - 1 - row, column, c])
-                    total[c, 0] += value * area
-                    total[c, 1] += value * across
-                    total[c, 2] += value * level
-                s, below = top, above
-            if next_k != k or next_row == height:
-                to = out[texels[k]]
-                for c in range(3):
-                    to[c, 0] += width * total[c, 0]
-                    to[c, 1] += wx * total[c, 1]
-                    to[c, 2] += width * total[c, 2]
-                    to[c, 3] += wz * total[c, 1]
-                total[:] = 0.0
-            row, k = next_row, next_k
+        else:
+            top, above = edges[k + 1], half_angles[k + 1]
+            next_k += 1
+        if top > s:
+            area, across, level = top - s, above - below, 0.5 * (top * top - s * s)
+            for c in range(3):
+                value = np.float64(radiance[height - 1 - row, column, c])
+                total[c, 0] += value * area
+                total[c, 1] += value * across
+                total[c, 2] += value * level
+            s, below = top, above
+        if next_k != k or next_row == rows[1]:
+            to = out[places[k]]
+            for c in range(3):
+                to[c, 0] += width * total[c, 0]
+                to[c, 1] += wx * total[c, 1]
+                to[c, 2] += width * total[c, 2]
+                to[c, 3] += wz * total[c, 1]
+            total[:] = 0.0
+        row, k = next_row, next_k
 
 
 @njit(cache=True, nogil=True)
@@ -189,7 +206,7 @@ def _meridian(sin_l, cos_l, resolution, table, edges, half_angles, texels):  # t
         texels[count] = (face * r + (r - 1 - i)) * r + column
         count += 1
         edges[count] = v / math.sqrt(1.0 + v * v)
-        half_angles[count] = _half_angle(table, v)
+        half_angles[count] = half_angle(table, v)
     # +Y face: from the rim inwards; s = x, t = z. Written from the pole outwards, then turned round.
     start = count
     count += _cap(sin_l, cos_l, r, 2, table, start, edges, half_angles, texels)
@@ -233,7 +250,7 @@ def _cap(ds, dt, resolution, face, table, first, edges, half_angles, texels):  #
             rho = rim
         square = 1.0 / (1.0 + rho * rho)
         edges[count] = math.sqrt(square)
-        half_angles[count] = 0.25 * math.pi - _half_angle(table, rho) + rho * square
+        half_angles[count] = 0.25 * math.pi - half_angle(table, rho) + rho * square
         if last:
             return count - first
         if rho_c <= rho:

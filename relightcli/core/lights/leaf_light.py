@@ -1,0 +1,179 @@
+"""From a latitude-longitude map to the light of clusters: flux and moment of what arrives through every leaf.
+
+As in `environment`, the sphere is cut into meridian strips, whose borders are the map's columns and those of the leaves
+on the side faces; in a strip the pixels and the leaves that its middle meets from pole to pole are two partitions of
+s = sin(latitude), so that each pixel's light is shared out completely, whatever the resolution of either. Only the
+pixels asked for are visited, and what they bring does not depend on the others: an edit changes the leaves that it
+touches, to the bit no others.
+"""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from relightcli.core.lights.environment import half_angle, half_angles_table, merge_strip
+from relightcli.core.lights.quadtree import Tree, leaf_of_texel
+
+WIDEST = math.radians(0.36)  # of a strip
+BANDS = 8  # of strips, summed apart
+
+
+class LeafLight(NamedTuple):
+    """flux (m, 3) float64: integral of the radiance over every leaf; moment (m, 3, 3): per colour, of L w."""
+
+    flux: NDArray[np.float64]
+    moment: NDArray[np.float64]
+
+
+def leaf_light(
+    radiance: NDArray[np.float32],
+    tree: Tree,
+    rotate_degrees: float = 0.0,
+    threads: int = 1,
+    rows: NDArray[np.int64] | None = None,
+) -> LeafLight:
+    """Light of the leaves under a map (H, W, 3) turned by `rotate_degrees` about +Y, right-handed.
+
+    rows (W, 2): the rows of each column, half open, that count; the others are as black. None: all. The sums do not
+    depend on `threads`.
+    """
+    height, width = radiance.shape[:2]
+    turn = math.radians(math.fmod(rotate_degrees, 360.0))
+    source = np.ascontiguousarray(radiance, np.float32)
+    if rows is None:
+        rows = np.tile(np.array([0, height]), (width, 1))
+    row_edges = np.cos(math.pi * np.arange(height + 1) / height)[::-1].copy()  # rising s, from the south pole
+    row_half_angles = 0.5 * (np.arcsin(row_edges) + row_edges * np.sqrt(np.maximum(0.0, 1.0 - row_edges**2)))
+    column, borders = _strips(width, turn, tree)
+    strips = np.flatnonzero(rows[column, 1] > rows[column, 0])
+    south = np.ascontiguousarray(height - rows[:, ::-1])
+    bands = np.array_split(strips, BANDS)
+    parts = [np.zeros((len(tree.cell), 3, 4)) for _ in bands]
+    table = half_angles_table()
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        jobs = [
+            pool.submit(_walk, source, band, column, borders, south, tree, row_edges, row_half_angles, table, out)
+            for band, out in zip(bands, parts, strict=True)
+        ]
+        for job in jobs:
+            job.result()
+    total = parts[0]
+    for part in parts[1:]:
+        total += part
+    return LeafLight(total[:, :, 0].copy(), total[:, :, 1:].copy())
+
+
+def _strips(width: int, turn: float, tree: Tree) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Column of the map that each strip lies in, (S,), and the strips' borders, (S + 1,), rising longitudes."""
+    even = max(width, math.ceil(2.0 * math.pi / WIDEST))
+    columns = -math.pi + (2.0 * math.pi / width) * np.arange(width) + turn
+    columns = np.mod(columns + math.pi, 2.0 * math.pi) - math.pi
+    spaced = -math.pi + (2.0 * math.pi / even) * np.arange(even + 1)
+    borders = np.unique(np.concatenate([columns, tree.meridian, [-math.pi, math.pi], spaced if even > width else []]))
+    borders = borders[np.concatenate([[True], np.diff(borders) > 1e-14])]
+    middle = 0.5 * (borders[1:] + borders[:-1])
+    k = np.floor(np.mod(middle - turn + math.pi, 2.0 * math.pi) * (width / (2.0 * math.pi))).astype(np.int64)
+    return width - 1 - np.clip(k, 0, width - 1), borders
+
+
+@njit(cache=True, nogil=True)
+def _walk(radiance, strips, columns, borders, south, tree, row_edges, row_half_angles, table, out):  # type: ignore[no-untyped-def]
+    room = 6 * tree.resolution + 8
+    edges, half_angles, leaves = np.empty(room), np.empty(room), np.empty(room, np.int64)
+    total = np.empty((3, 3))
+    for strip in strips:
+        low, high = borders[strip], borders[strip + 1]
+        middle = 0.5 * (low + high)
+        count = _meridian(tree, math.sin(middle), math.cos(middle), table, edges, half_angles, leaves)
+        rows = (south[columns[strip], 0], south[columns[strip], 1])
+        merge_strip(
+            radiance, columns[strip], rows, row_edges, row_half_angles, edges, half_angles, leaves, count,
+            middle, high - low, total, out,
+        )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _meridian(tree, sin_l, cos_l, table, edges, half_angles, leaves):  # type: ignore[no-untyped-def]
+    """Leaves met along a meridian from the south to the north pole, with the s = sin(latitude) of their borders.
+
+    Returns their number n; leaf k spans edges[k]..edges[k + 1]. half_angles: the antiderivative of cos(latitude).
+    """
+    r = tree.resolution
+    # -Y face: from the pole outwards; s = x = rho sin, t = -z = -rho cos, with rho = -1 / tan(latitude).
+    count = _cap(tree, sin_l, -cos_l, 3, table, 0, edges, half_angles, leaves)
+    for k in range(count + 1):
+        edges[k], half_angles[k] = -edges[k], -half_angles[k]
+    # Side face: tan(latitude) = m v with v = -t from -1 to 1.
+    if abs(sin_l) > abs(cos_l):
+        face = 0 if sin_l > 0 else 1
+        m = abs(sin_l)
+        right = -cos_l if sin_l > 0 else cos_l
+    else:
+        face = 4 if cos_l > 0 else 5
+        m = abs(cos_l)
+        right = sin_l if cos_l > 0 else -sin_l
+    column = min(max(math.floor((right / m + 1.0) * 0.5 * r), 0), r - 1)
+    row = r
+    while row > 0:
+        leaf = leaf_of_texel(tree, face, row - 1, column)
+        row = tree.cell[leaf, 1]
+        v = m * (1.0 - 2.0 * row / r)
+        leaves[count] = leaf
+        count += 1
+        edges[count] = v / math.sqrt(1.0 + v * v)
+        half_angles[count] = half_angle(table, v)
+    # +Y face: from the rim inwards; s = x, t = z. Written from the pole outwards, then turned round.
+    start = count
+    count += _cap(tree, sin_l, cos_l, 2, table, start, edges, half_angles, leaves)
+    i, j = start, count - 1
+    while i < j:
+        leaves[i], leaves[j] = leaves[j], leaves[i]
+        i += 1
+        j -= 1
+    i, j = start, count
+    while i < j:
+        edges[i], edges[j] = edges[j], edges[i]
+        half_angles[i], half_angles[j] = half_angles[j], half_angles[i]
+        i += 1
+        j -= 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _cap(tree, ds, dt, face, table, first, edges, half_angles, leaves):  # type: ignore[no-untyped-def]
+    """Leaves of a pole face along the ray rho (ds, dt) from the pole to the rim, from place `first` on, and their
+    borders as on the northern face. Returns their number."""
+    r = tree.resolution
+    half = 0.5 * r
+    rim = 1.0 / max(abs(ds), abs(dt))
+    # In texels the ray is half + rho half d; an even face has a border at its middle.
+    column = r // 2 if r % 2 or ds >= 0 else r // 2 - 1
+    row = r // 2 if r % 2 or dt >= 0 else r // 2 - 1
+    edges[first], half_angles[first] = 1.0, 0.25 * math.pi
+    count = first
+    while True:
+        leaf = leaf_of_texel(tree, face, row, column)
+        r0, r1, c0, c1 = tree.cell[leaf, 1], tree.cell[leaf, 2], tree.cell[leaf, 3], tree.cell[leaf, 4]
+        rho_c = ((c1 if ds > 0 else c0) - half) / (half * ds) if ds != 0.0 else math.inf
+        rho_r = ((r1 if dt > 0 else r0) - half) / (half * dt) if dt != 0.0 else math.inf
+        rho = min(rho_c, rho_r)
+        leaves[count] = leaf
+        count += 1
+        last = rho >= rim * (1.0 - 1e-12)
+        if last:
+            rho = rim
+        square = 1.0 / (1.0 + rho * rho)
+        edges[count] = math.sqrt(square)
+        half_angles[count] = 0.25 * math.pi - half_angle(table, rho) + rho * square
+        if last:
+            return count - first
+        new_column, new_row = math.floor(half + rho * half * ds), math.floor(half + rho * half * dt)
+        column = (c1 if ds > 0 else c0 - 1) if rho_c <= rho else min(max(new_column, c0), c1 - 1)
+        row = (r1 if dt > 0 else r0 - 1) if rho_r <= rho else min(max(new_row, r0), r1 - 1)
+        column, row = min(max(column, 0), r - 1), min(max(row, 0), r - 1)
