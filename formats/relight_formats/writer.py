@@ -66,6 +66,11 @@ class Writer:
         """Ids of the blocks whose results are on disk."""
         return frozenset(block["id"] for block in self._ledger.blocks)
 
+    @property
+    def blocks(self) -> list[dict[str, Any]]:
+        """The ledger so far: per finished block `id` and what was recorded with it."""
+        return list(self._ledger.blocks)
+
     def array(
         self,
         name: str,

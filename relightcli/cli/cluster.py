@@ -30,6 +30,32 @@ from relightcli.cli import options
     type=click.IntRange(1, 16),
     help="Basis functions for the specular lobe of an adjustable material, as light bounces off it.",
 )
+@click.option(
+    "--light-resolution",
+    "resolution",
+    default=None,
+    type=int,
+    help="Cluster the lights of the sky instead: texels along a face of its cube, 1 to 4096. Default: 1024 where the "
+    "store holds direct light only.",
+)
+@click.option(
+    "--epsilon",
+    default=None,
+    type=float,
+    help="Lights: the error that a cluster may have by its criterion. Default: 0.0425, or 5e-5 for paper.",
+)
+@click.option(
+    "--criterion",
+    default="rms",
+    show_default=True,
+    type=click.Choice(["rms", "paper"]),
+    help="Lights: area-weighted RMS of transfer, or the norm over the number of receivers of Johan and Nishita.",
+)
+@click.option(
+    "--lights", default=None, type=int, help="Lights: at most so many clusters; the largest error is split first."
+)
+@click.option("--seconds", default=None, type=float, help="Lights: refine so long; the largest error is split first.")
+@click.option("--camera", default=None, help="Lights: the view for which specular lobes are kept.")
 @click.option("--seed", default=0, type=options.SEED, show_default=True, help="Seed of samples and first centres.")
 @click.option("--dry-run", is_flag=True, help="Say what would be made; do nothing.")
 @options.workers
@@ -38,14 +64,43 @@ from relightcli.cli import options
 def command(
     store: Path, output: Path, workers: int | None, verbose: bool, quiet: bool, as_json: bool, **settings: Any
 ) -> None:
-    """Group the receivers of the transfer store STORE, and find a basis for their light."""
+    """Group the receivers of the transfer store STORE and find a basis for their light; or, with --light-resolution
+    and for stores of direct light, group the lights of the sky."""
+    common: dict[str, Any] = {"store": store, "output": output, "workers": workers or options.available_cores()}
+    common |= {"quiet": quiet or as_json} | {name: settings[name] for name in ("seed", "dry_run", "overwrite")}
+    asked: dict[str, Any] = {name: value for name, value in settings.items() if name in OF_LIGHTS and value is not None}
+    if set(asked) - {"criterion"} or _direct_only(store):
+        from relightcli.stages.light_clusters import Config as LightConfig
+        from relightcli.stages.light_clusters import cluster_lights
+
+        options.tell(result := cluster_lights(LightConfig(**common, **asked)), _light_text(result), as_json, quiet)
+        return
     from relightcli.stages.cluster import Config, cluster
 
-    config = Config(
-        store=store, output=output, workers=workers or options.available_cores(), quiet=quiet or as_json, **settings
+    of_receivers: dict[str, Any] = {name: settings[name] for name in ("clusters", "tolerance", "functions")}
+    options.tell(result := cluster(Config(**common, **of_receivers)), _text(result), as_json, quiet)
+
+
+OF_LIGHTS = ("resolution", "epsilon", "criterion", "lights", "seconds", "camera")
+
+
+def _direct_only(store: Path) -> bool:
+    import relight_formats as formats
+
+    opened = formats.open_store(store)
+    return opened.kind == "transfer" and "bounce/hit" not in opened
+
+
+def _light_text(result: dict[str, Any]) -> str:
+    if result.get("dry_run"):
+        return f"{result['receivers']} receivers, {6 * result['resolution'] ** 2} lights"
+    if result["status"] == "up to date":
+        return f"{result['store']} is up to date"
+    return (
+        f"{result['store']}: {result['lights']} lights in {result['light_clusters']} clusters, RMS error "
+        f"{result['error']:.4f} of a light overhead, {result['rays'] / 1e6:.1f} million rays, "
+        f"{options.bytes_text(result['bytes'])}, {result['seconds']:.1f} s"
     )
-    result = cluster(config)
-    options.tell(result, _text(result), as_json, quiet)
 
 
 def _text(result: dict[str, Any]) -> str:

@@ -30,6 +30,14 @@ from relightcli.cli import options
 )
 @click.option("--frames", default=None, type=options.PATH, help="Keyframes (TOML); output name with ####.")
 @click.option("--layers", is_flag=True, help="Write the parts of the picture as EXR layers.")
+@click.option(
+    "--from",
+    "previous",
+    default=None,
+    type=options.PATH,
+    metavar="PREVIOUS",
+    help="A radiance store (.zarr) of the same clustered lights: recompute only what has changed since.",
+)
 @click.option("--background", type=click.Choice(["none", "env"]), default="none", help="What misses show.")
 @click.option("--exposure", default=0.0, help="Stops, for display formats.")
 @click.option(

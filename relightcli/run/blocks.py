@@ -26,7 +26,7 @@ from relightcli.errors import SystemFault
 
 RETRIES = 2  # new worker pools after one broke without finishing a single block
 PATIENCE = 5.0  # seconds that workers get to leave before they are killed
-Info = dict[str, float]
+Info = dict[str, Any]
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 IN_MEMORY = 1 << 30  # visibility up to this size stays in memory between frames
 ENTRIES = 1 << 23  # of pixels' gathers that are made at a time
-KINDS = ("transfer", "clusters", "asset")
+KINDS = ("transfer", "clusters", "asset", "light_clusters")
 BLACK = (0.0, 0.0, 0.0)
 
 
@@ -115,10 +115,11 @@ class LightingStore:
         self._gathered: dict[int, Gather] = {}
         self._seen: list[tuple[int, Gather]] | None = None
         self._bits: Future[NDArray[np.uint8]] | None = None
-        layout = self.store.layouts["visibility/bits"]
-        if layout.raw_bytes <= IN_MEMORY:  # decoded beside the making of the first view
-            self._bits = ThreadPoolExecutor(1).submit(read, "visibility/bits")
-        self._chunk = layout.chunks[0]
+        if "visibility/bits" in self.store:
+            layout = self.store.layouts["visibility/bits"]
+            if layout.raw_bytes <= IN_MEMORY:  # decoded beside the making of the first view
+                self._bits = ThreadPoolExecutor(1).submit(read, "visibility/bits")
+            self._chunk = layout.chunks[0]
 
     def __len__(self) -> int:
         return len(self.position)
@@ -128,6 +129,20 @@ class LightingStore:
         """The camera whose pixels are the receivers, or None for vertices."""
         kind, _, name = str(self.store.settings["receivers"]).partition(":")
         return name if kind == "pixels" else None
+
+    @property
+    def changed(self) -> int | None:
+        """Clusters of lights that the last frame changed; None where that is not how light is computed."""
+        return None
+
+    def resume(self, previous: Path) -> None:
+        """Takes up the light of an earlier run. Raises InputError where a store has no use for it."""
+        raise InputError(
+            f"--from {previous}: needs a store of clustered lights, which cluster --light-resolution makes"
+        )
+
+    def put_light(self, writer: formats.Writer) -> None:
+        """Writes what a later `resume` needs, if anything."""
 
     def receiver_of_vertex(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Receiver on the front and on the back of every vertex, (V,) int32 each, -1 where there is none."""

@@ -33,6 +33,7 @@ class Config:
     camera: str | None = None
     settings: tuple[str, ...] = ()
     frames: Path | None = None
+    previous: Path | None = None
     layers: bool = False
     background: bool = False
     exposure: float = 0.0
@@ -62,13 +63,15 @@ def check(config: Config, suffix: str) -> None:
     sequence = config.frames is not None
     if sequence and suffix != ".zarr" and "#" not in Path(config.output).name:
         raise InputError(f"--output {config.output}: a sequence needs #### in the name for the frame number")
+    if config.previous is not None and config.reference:
+        raise InputError("--from: has nothing to give to --reference")
     if config.layers and suffix != ".exr":
         raise InputError(f"--layers: expected an .exr output, which can hold layers; found {config.output}")
     if config.reference and suffix not in PICTURES:
         raise InputError(f"--reference makes pictures; expected one of {', '.join(PICTURES)}; found {config.output}")
     if not np.isfinite(config.env_rotate) or not np.isfinite(config.exposure):
         raise InputError("--env-rotate and --exposure: expected finite numbers")
-    for name, path in (("the store", config.store), ("--env", config.env)):
+    for name, path in (("the store", config.store), ("--env", config.env), ("--from", config.previous)):
         if path is not None and _same_file(config.output, path):
             raise InputError(f"--output {config.output}: is {name} itself; expected another name")
 

@@ -28,6 +28,8 @@ def relight(config: Config) -> dict[str, Any]:
         return render_reference(config, shots, suffix, started)
     lighting = open_lighting(config.store, config.workers)
     check_shots(config, shots, lighting.scene)
+    if config.previous is not None:
+        lighting.resume(config.previous)
     if config.dry_run:
         return _plan(config, shots, lighting)
     session = Session(lighting, config)
@@ -47,6 +49,7 @@ def relight(config: Config) -> dict[str, Any]:
         "lighting_seconds": session.lighting_seconds / len(written),
         "frame_seconds": clocks,
         "rates": session.rates(),
+        **({} if lighting.changed is None else {"changed_clusters": lighting.changed}),
         "notes": session.notes,
     }
 
@@ -54,11 +57,15 @@ def relight(config: Config) -> dict[str, Any]:
 def open_lighting(path: Path, threads: int) -> LightingStore:
     """The store of any stage that pictures are made from."""
     store = formats.open_store(path)
-    if store.kind != "asset":
-        return LightingStore(store, threads)
-    from relightcli.stages.asset import AssetStore
+    if store.kind == "asset":
+        from relightcli.stages.asset import AssetStore
 
-    return AssetStore(store, threads)
+        return AssetStore(store, threads)
+    if store.kind == "light_clusters":
+        from relightcli.stages.clustered import ClusteredStore
+
+        return ClusteredStore(store, threads)
+    return LightingStore(store, threads)
 
 
 def _plan(config: Config, shots: list[Shot], lighting: LightingStore) -> dict[str, Any]:

@@ -220,6 +220,7 @@ class Session:
         config, store = self.config, self.lighting.store
         radiance = np.stack(self._radiance)
         _need_finite(radiance, str(config.store))
+        previous = {} if config.previous is None else {"previous": formats.open_store(config.previous).fingerprint}
         writer = formats.begin(
             config.output,
             "radiance",
@@ -232,7 +233,7 @@ class Session:
                 "bounces": config.bounces,
                 "frames": None if config.frames is None else formats.fingerprint_file(config.frames),
             },
-            inputs={"store": store.fingerprint, **self._maps},
+            inputs={"store": store.fingerprint, **self._maps, **previous},
             program=f"relightcli {__version__}",
             overwrite=config.overwrite,
         )
@@ -241,6 +242,7 @@ class Session:
         with writer:
             writer.put("radiance", radiance, dims=("frame", "receiver", "colour"), units="W sr-1 m-2")
             writer.put("receivers/position", self.lighting.position, dims=("receiver", "axis"), units="m")
+            self.lighting.put_light(writer)
             writer.commit({})
 
 

@@ -13,6 +13,9 @@ approximated. The error of sample l is
 a_i the receivers' areas, relative to the transfer of an unblocked light overhead. It does not depend on how finely the
 mesh is cut. The paper's own error, (11), is the L2 norm over the receivers of T_C - T_l, over their number, with T the
 reflectance times v c, and T_C its mean over the samples.
+
+Where the view is fixed, a receiver with a specular lobe has a second transfer, S_il = v_il times lobe times cosine, of
+which the mean over the samples is kept. Its error joins the first one's before the square, both as radiance.
 """
 
 from __future__ import annotations
@@ -22,16 +25,17 @@ from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.bits import trailing_zeros
+from relightcli.core.brdf.models import MaterialTable, lobes_and_density
 
 
 def visibility_errors(
     visible: NDArray[np.uint64], directions: NDArray[np.float64], normal: NDArray[np.float32], area: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """e_l (S,) of the samples of a cell. visible (S, W) bits of N receivers; directions (S, 3); normal (N, 3) unit;
+    """e_l^2 (S,) of the samples of a cell. visible (S, W) bits of N receivers; directions (S, 3); normal (N, 3) unit;
     area (N,), which sum to 1."""
     square = np.zeros(len(visible))
     _visibility_errors(visible, np.ascontiguousarray(directions), normal, area, square)
-    return np.sqrt(square)
+    return square
 
 
 def paper_errors(
@@ -54,6 +58,39 @@ def fractions(
     out = np.zeros(len(normal), np.uint8)
     _fractions(visible, np.ascontiguousarray(directions), normal, out)
     return out
+
+
+def lobe_transfer(
+    visible: NDArray[np.uint64],
+    directions: NDArray[np.float64],
+    normal: NDArray[np.float32],
+    view: NDArray[np.float32],
+    rows: NDArray[np.int64],
+    material: NDArray[np.int32],
+    table: MaterialTable,
+) -> NDArray[np.float32]:
+    """S_il (S, n) of the receivers `rows` (n,), without the specular colour. view (N, 3) unit, to the viewer; material
+    (N,): row of the table."""
+    out = np.zeros((len(visible), len(rows)), np.float32)
+    d = np.ascontiguousarray(directions)
+    _lobe_transfer(visible, d, normal, view, rows, material, table.model, table.parameters, out)
+    return out
+
+
+def add_glossy_errors(
+    square: NDArray[np.float64],
+    visible: NDArray[np.uint64],
+    directions: NDArray[np.float64],
+    normal: NDArray[np.float32],
+    rows: NDArray[np.int64],
+    lobes: NDArray[np.float32],
+    diffuse: NDArray[np.float64],
+    specular: NDArray[np.float64],
+    area: NDArray[np.float64],
+) -> None:
+    """Adds to the squared errors (S,) those of receivers with lobes (S, n). diffuse (N,): reflectance over that of the
+    reference; specular (N,): luminance of the specular colour over the reference; area (N,) sums to 1."""
+    _add_glossy_errors(square, visible, np.ascontiguousarray(directions), normal, rows, lobes, diffuse, specular, area)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -130,3 +167,34 @@ def _fractions(visible, directions, normal, out):  # type: ignore[no-untyped-def
                 out[i] = 255
             elif (some >> np.uint64(place)) & np.uint64(1):
                 out[i] = np.uint8(255.0 * _fraction(visible, directions, normal, i, cosines) + 0.5)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _lobe_transfer(visible, directions, normal, view, rows, material, model, parameters, out):  # type: ignore[no-untyped-def]
+    for j in range(len(rows)):
+        i = rows[j]
+        word, place = i >> 6, np.uint64(i & 63)
+        n = (np.float64(normal[i, 0]), np.float64(normal[i, 1]), np.float64(normal[i, 2]))
+        v = (np.float64(view[i, 0]), np.float64(view[i, 1]), np.float64(view[i, 2]))
+        for s in range(len(visible)):
+            if (visible[s, word] >> place) & np.uint64(1):
+                l = (directions[s, 0], directions[s, 1], directions[s, 2])  # noqa: E741
+                _, lobe, _, _ = lobes_and_density(model[material[i]], parameters[material[i]], n, l, v)
+                out[s, j] = lobe
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_glossy_errors(square, visible, directions, normal, rows, lobes, diffuse, specular, area):  # type: ignore[no-untyped-def]
+    cosines = np.empty(len(visible))
+    for j in range(len(rows)):
+        i = rows[j]
+        word, place = i >> 6, np.uint64(i & 63)
+        f = _fraction(visible, directions, normal, i, cosines)
+        mean = 0.0
+        for s in range(len(visible)):
+            mean += lobes[s, j]
+        mean /= len(visible)
+        for s in range(len(visible)):
+            v = 1.0 if (visible[s, word] >> place) & np.uint64(1) else 0.0
+            e = diffuse[i] * (f - v) * cosines[s] + specular[i] * (mean - lobes[s, j])
+            square[s] += area[i] * e * e

@@ -104,3 +104,14 @@ def _spread(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
     ):
         x = (x | (x << np.uint64(shift))) & np.uint64(mask)
     return x
+
+
+def receiver_areas(
+    positions: NDArray[np.float64], faces: NDArray[np.int32], vertex: NDArray[np.int32]
+) -> NDArray[np.float64]:
+    """The part of the surface that each receiver speaks for, (N,): a third of the faces around its `vertex` (N,)."""
+    corner = positions[faces]
+    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1) / 6.0
+    around = np.bincount(faces.reshape(-1), np.repeat(area, 3), len(positions))
+    out: NDArray[np.float64] = around[vertex]
+    return out

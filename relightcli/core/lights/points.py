@@ -1,0 +1,104 @@
+"""The few small and bright places of a map that deserve light of their own: a sun, a lamp.
+
+A cluster's visible fraction blurs the shadow of a light that is much smaller than the cluster. What lies in one texel
+of a fine cube and has a good part of all flux is therefore taken out of the map and handed over as a point, for which
+rays can tell exactly who sees it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from relightcli.core.lights.latlong import texel_solid_angles
+from relightcli.core.sphere import cube
+
+RESOLUTION = 256  # of the cube: 0.35 degrees
+LEAST = 0.01  # of the map's flux
+MOST = 24
+
+
+class Points(NamedTuple):
+    """direction (K, 3) unit, mean of what each holds; flux (K, 3); both float64."""
+
+    direction: NDArray[np.float64]
+    flux: NDArray[np.float64]
+
+
+def split_points(
+    radiance: NDArray[np.float32], rotate_degrees: float = 0.0
+) -> tuple[NDArray[np.float32], Points, NDArray[np.int64]]:
+    """A map (H, W, 3) without its points, the points as they lie after a turn by `rotate_degrees` about +Y, and the
+    flat indices of the pixels that went into them. The map is returned as it is if there are none."""
+    height, width = radiance.shape[:2]
+    solid = texel_solid_angles(height, width)
+    share = max(1.0, (4.0 * math.pi / (6 * RESOLUTION**2)) / float(solid.max()))
+    source = np.ascontiguousarray(radiance, np.float32)
+    rows = np.empty(height)
+    _row_flux(source, solid, rows)
+    least = LEAST * float(rows.sum())
+    # A texel and the pixels on its rim: if it has enough, one of them has its part.
+    bright = _brighter(source, solid, least / (4.0 * share + 1.0)) if least > 0.0 else np.zeros(0, np.int64)
+    none = Points(np.zeros((0, 3)), np.zeros((0, 3)))
+    if len(bright) == 0:
+        return radiance, none, bright
+    row, column = np.divmod(bright, width)
+    latitude = math.pi * (0.5 - (row + 0.5) / height)
+    longitude = math.pi * (1.0 - 2.0 * (column + 0.5) / width) + math.radians(math.fmod(rotate_degrees, 360.0))
+    d = np.stack([np.sin(longitude) * np.cos(latitude), np.sin(latitude), np.cos(longitude) * np.cos(latitude)], axis=1)
+    flux = source.reshape(-1, 3)[bright].astype(np.float64) * solid[row, None]
+    texel, owner = np.unique(cube.texel_index(d, RESOLUTION), return_inverse=True)
+    weight = flux.sum(axis=1)
+    total = np.bincount(owner, _luminance(flux), len(texel))
+    chosen = np.argsort(-total, kind="stable")[:MOST]
+    chosen = np.sort(chosen[total[chosen] >= least])
+    if len(chosen) == 0:
+        return radiance, none, np.zeros(0, np.int64)
+    mean = np.stack([np.bincount(owner, weight * d[:, x], len(texel)) for x in range(3)], axis=1)[chosen]
+    summed = np.stack([np.bincount(owner, flux[:, c], len(texel)) for c in range(3)], axis=1)[chosen]
+    taken = bright[np.isin(owner, chosen)]
+    rest = source.copy()
+    rest.reshape(-1, 3)[taken] = 0.0
+    return rest, Points(mean / np.linalg.norm(mean, axis=1, keepdims=True), summed), taken
+
+
+def _luminance(flux: NDArray[np.float64]) -> NDArray[np.float64]:
+    return 0.2126 * flux[:, 0] + 0.7152 * flux[:, 1] + 0.0722 * flux[:, 2]
+
+
+@njit(cache=True, nogil=True)
+def _row_flux(radiance, solid, rows):  # type: ignore[no-untyped-def]
+    for i in range(radiance.shape[0]):
+        red = green = blue = 0.0
+        for j in range(radiance.shape[1]):
+            red += radiance[i, j, 0]
+            green += radiance[i, j, 1]
+            blue += radiance[i, j, 2]
+        rows[i] = (0.2126 * red + 0.7152 * green + 0.0722 * blue) * solid[i]
+
+
+def _brighter(radiance: NDArray[np.float32], solid: NDArray[np.float64], least: float) -> NDArray[np.int64]:
+    out = np.empty(4096, np.int64)
+    while True:
+        count = _find_brighter(radiance, solid, least, out)
+        if count <= len(out):
+            return out[:count]
+        out = np.empty(count, np.int64)
+
+
+@njit(cache=True, nogil=True)
+def _find_brighter(radiance, solid, least, out):  # type: ignore[no-untyped-def]
+    count = 0
+    for i in range(radiance.shape[0]):
+        level = least / solid[i]
+        for j in range(radiance.shape[1]):
+            y = 0.2126 * radiance[i, j, 0] + 0.7152 * radiance[i, j, 1] + 0.0722 * radiance[i, j, 2]
+            if y >= level:
+                if count < len(out):
+                    out[count] = i * radiance.shape[1] + j
+                count += 1
+    return count

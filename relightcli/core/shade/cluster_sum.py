@@ -1,0 +1,222 @@
+"""Irradiance from clusters of lights: E_i = sum_k f_ik max(0, n_i . m_k), per colour, f the visible fraction of
+cluster k at receiver i and m_k the moment of the light that it holds.
+
+Receivers are taken 64 at a time. Where all 64 see nothing of a cluster it costs nothing; where all see all of it, its
+moment joins a sum that is the same for the 64; only what is mixed is kept in memory, a byte per receiver. Sums are
+float64: a sun of 1e6 that is added and taken away again leaves the digits of a sky of 1e-3.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+GROUP = 64
+NONE, ALL = -1, -2
+
+
+class Fractions:
+    """Visible fractions (m, N) of m clusters at N receivers, packed.
+
+    place (G, m) int32: row of `mixed` (Q, 64) uint8 with the fractions of a group of 64 receivers in steps of 1/255,
+    or NONE or ALL where it is 0 or 1 at all of them.
+    """
+
+    def __init__(self, columns: Iterable[NDArray[np.uint8]], normal: NDArray[np.float32]) -> None:
+        """columns: the fractions (m, n) of runs of receivers, n a multiple of 64 but for the last."""
+        places, parts, count = [], [], 0
+        for column in columns:
+            place, mixed = _pack(column, count)
+            places.append(place)
+            parts.append(mixed)
+            count += len(mixed)
+        self.place = np.concatenate(places)
+        self.mixed = np.concatenate(parts)
+        groups = len(self.place)
+        padded = np.zeros((groups * GROUP, 3))
+        padded[: len(normal)] = normal
+        self.normal = np.ascontiguousarray(padded.reshape(groups, GROUP, 3).transpose(0, 2, 1))
+        self.count = len(normal)
+
+    def sum(self, moment: NDArray[np.float64], threads: int) -> NDArray[np.float64]:
+        """Irradiance (N, 3) float64 of moments (m, 3, 3): per colour, x, y, z."""
+        out = np.zeros((len(self.place), 3, GROUP))
+        flat = moment.reshape(-1, 9)
+        _in_parts(
+            lambda a, b: _sum_all(self.place[a:b], self.mixed, self.normal[a:b], flat, out[a:b]), len(out), threads
+        )
+        return self._by_receiver(out)
+
+    def change(
+        self,
+        clusters: NDArray[np.int64],
+        old: NDArray[np.float64],
+        new: NDArray[np.float64],
+        threads: int,
+    ) -> NDArray[np.float64]:
+        """What E gains when the moments of some clusters go from old (k, 3, 3) to new: (N, 3) float64."""
+        out = np.zeros((len(self.place), 3, GROUP))
+        a9, b9 = old.reshape(-1, 9), new.reshape(-1, 9)
+        _in_parts(
+            lambda a, b: _change(self.place[a:b], self.mixed, self.normal[a:b], clusters, a9, b9, out[a:b]),
+            len(out),
+            threads,
+        )
+        return self._by_receiver(out)
+
+    def of(self, cluster: int) -> NDArray[np.uint8]:
+        """One cluster's fractions, (N,), in steps of 1/255."""
+        place = self.place[:, cluster]
+        out = np.zeros((len(place), GROUP), np.uint8)
+        out[place == ALL] = 255
+        out[place >= 0] = self.mixed[place[place >= 0]]
+        return out.reshape(-1)[: self.count]
+
+    def _by_receiver(self, out: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.ascontiguousarray(out.transpose(0, 2, 1)).reshape(-1, 3)[: self.count]
+
+
+def _in_parts(work, count: int, threads: int) -> None:  # type: ignore[no-untyped-def]
+    cuts = np.unique(np.linspace(0, count, 4 * max(1, threads) + 1).astype(int))
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        for job in [pool.submit(work, a, b) for a, b in itertools.pairwise(cuts)]:
+            job.result()
+
+
+def _pack(column: NDArray[np.uint8], first: int, whole: bool = True) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
+    """Places, counted from `first`, and what is mixed; whole: groups that are full throughout are no more than ALL."""
+    groups = -(-column.shape[1] // GROUP)
+    place = np.empty((groups, len(column)), np.int32)
+    count = _find(column, place, whole)
+    mixed = np.zeros((count, GROUP), np.uint8)
+    _keep(column, place, mixed, first)
+    return place, mixed
+
+
+@njit(cache=True, nogil=True)
+def _find(column, place, whole):  # type: ignore[no-untyped-def]
+    count = 0
+    n = column.shape[1]
+    for k in range(len(column)):
+        for g in range(len(place)):
+            low, high = np.uint8(255), np.uint8(0)
+            for i in range(g * GROUP, min(g * GROUP + GROUP, n)):
+                low, high = min(low, column[k, i]), max(high, column[k, i])
+            if high == 0:
+                place[g, k] = NONE
+            elif low == 255 and whole:
+                place[g, k] = ALL
+            else:
+                place[g, k] = 0
+                count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _keep(column, place, mixed, first):  # type: ignore[no-untyped-def]
+    """Group by group, so that a sum over all clusters reads straight on."""
+    count = 0
+    n = column.shape[1]
+    for g in range(len(place)):
+        for k in range(len(column)):
+            if place[g, k] == 0:
+                for i in range(g * GROUP, min(g * GROUP + GROUP, n)):
+                    mixed[count, i - g * GROUP] = column[k, i]
+                place[g, k] = first + count
+                count += 1
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _sum_all(place, mixed, normal, moment, out):  # type: ignore[no-untyped-def]
+    whole = np.empty(9)
+    for g in range(len(place)):
+        whole[:] = 0.0
+        x, y, z = normal[g, 0], normal[g, 1], normal[g, 2]
+        red, green, blue = out[g, 0], out[g, 1], out[g, 2]
+        for k in range(place.shape[1]):
+            p = place[g, k]
+            if p == NONE:
+                continue
+            if p == ALL:
+                for q in range(9):
+                    whole[q] += moment[k, q]
+                continue
+            a, b, c = moment[k, 0], moment[k, 1], moment[k, 2]
+            d, e, f = moment[k, 3], moment[k, 4], moment[k, 5]
+            r, s, t = moment[k, 6], moment[k, 7], moment[k, 8]
+            row = mixed[p]
+            for i in range(GROUP):
+                v = np.float64(row[i])
+                red[i] += v * max(x[i] * a + y[i] * b + z[i] * c, 0.0)
+                green[i] += v * max(x[i] * d + y[i] * e + z[i] * f, 0.0)
+                blue[i] += v * max(x[i] * r + y[i] * s + z[i] * t, 0.0)
+        for i in range(GROUP):
+            red[i] = red[i] / 255.0 + x[i] * whole[0] + y[i] * whole[1] + z[i] * whole[2]
+            green[i] = green[i] / 255.0 + x[i] * whole[3] + y[i] * whole[4] + z[i] * whole[5]
+            blue[i] = blue[i] / 255.0 + x[i] * whole[6] + y[i] * whole[7] + z[i] * whole[8]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _change(place, mixed, normal, clusters, old, new, out):  # type: ignore[no-untyped-def]
+    for g in range(len(place)):
+        x, y, z = normal[g, 0], normal[g, 1], normal[g, 2]
+        for j in range(len(clusters)):
+            p = place[g, clusters[j]]
+            if p == NONE:
+                continue
+            for c in range(3):
+                a, b, d = old[j, 3 * c], old[j, 3 * c + 1], old[j, 3 * c + 2]
+                e, f, h = new[j, 3 * c], new[j, 3 * c + 1], new[j, 3 * c + 2]
+                into = out[g, c]
+                if p == ALL:
+                    for i in range(GROUP):
+                        into[i] += x[i] * (e - a) + y[i] * (f - b) + z[i] * (h - d)
+                else:
+                    row = mixed[p]
+                    for i in range(GROUP):
+                        before = max(x[i] * a + y[i] * b + z[i] * d, 0.0)
+                        after = max(x[i] * e + y[i] * f + z[i] * h, 0.0)
+                        into[i] += np.float64(row[i]) / 255.0 * (after - before)
+
+
+class Lobes:
+    """Transfer (m, n) by specular lobes from m clusters to n receivers, packed like `Fractions`: place (G, m), the
+    steps (Q, 64) uint8 and a step's size (Q,) float32 for each group that has any."""
+
+    def __init__(self, steps: NDArray[np.uint8], scale: NDArray[np.float32]) -> None:
+        """steps (m, n); scale (m, ceil(n / 64))."""
+        self.place, self.mixed = _pack(steps, 0, whole=False)
+        self.count = steps.shape[1]
+        self.scale = np.zeros(len(self.mixed), np.float32)
+        group, cluster = np.nonzero(self.place >= 0)
+        self.scale[self.place[group, cluster]] = scale[cluster, group]
+
+    def sum(self, clusters: NDArray[np.int64], flux: NDArray[np.float64], threads: int) -> NDArray[np.float64]:
+        """Specular light (n, 3) float64 of some clusters with flux (k, 3), without the specular colour."""
+        out = np.zeros((len(self.place), 3, GROUP))
+        _in_parts(
+            lambda a, b: _sum_lobes(self.place[a:b], self.mixed, self.scale, clusters, flux, out[a:b]),
+            len(out),
+            threads,
+        )
+        return np.ascontiguousarray(out.transpose(0, 2, 1)).reshape(-1, 3)[: self.count]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _sum_lobes(place, mixed, scale, clusters, flux, out):  # type: ignore[no-untyped-def]
+    for g in range(len(place)):
+        for j in range(len(clusters)):
+            p = place[g, clusters[j]]
+            if p < 0:
+                continue
+            row = mixed[p]
+            for c in range(3):
+                step = np.float64(scale[p]) * flux[j, c]
+                into = out[g, c]
+                for i in range(GROUP):
+                    into[i] += np.float64(row[i]) * step

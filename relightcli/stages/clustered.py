@@ -1,0 +1,278 @@
+"""Direct light from clusters of the sky: any map of any resolution, and only what changed from one map to the next.
+
+the map             small bright places become points, for which rays are traced; the rest is shared out over leaves
+a new map           moments of the leaves that changed, and what they change in the irradiance [Johan and Nishita,
+                    Eq. 15, with C_t for the printed C_i]
+specular lobes      as baked in for one view; their colour may change
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+import relight_formats as formats
+from relightcli.adapters.rays import Tracer
+from relightcli.core.brdf.models import SPECULAR, MaterialTable, widen
+from relightcli.core.lights.leaf_light import LeafLight, leaf_light
+from relightcli.core.lights.points import Points, split_points
+from relightcli.core.lights.quadtree import Tree, build_tree, leaves_at
+from relightcli.core.shade.cluster_sum import Fractions, Lobes
+from relightcli.core.transport.light_clusters import lobe_transfer
+from relightcli.errors import InputError, StoreError
+from relightcli.scene.model import Material
+from relightcli.stages.lighting import LightingStore, Radiance, _Coats
+
+PARTLY = 0.25  # of the clusters: if more have changed, all are summed again
+KEPT = 64  # points whose visibility is kept
+
+
+class ClusteredStore(LightingStore):
+    """An open store of clustered lights."""
+
+    def __init__(self, store: Path | formats.Store, threads: int) -> None:
+        super().__init__(store, threads)
+        self._sky: _ClusteredSky | None = None
+        self._lobes: _BakedLobes | None = None
+
+    def exit_radiance(
+        self,
+        environment: NDArray[np.float32],
+        rotate: float,
+        materials: dict[str, Material],
+        view: NDArray[np.float32] | None,
+        active: NDArray[np.bool_] | None = None,
+        basis: str | None = None,
+        bounces: int | None = None,
+    ) -> list[Radiance]:
+        """See `LightingStore.exit_radiance`. Raises InputError for a basis, and for lobes that are not baked in."""
+        if basis is not None:
+            raise InputError("--basis: the store holds clustered lights; use the transfer store it came from")
+        return super().exit_radiance(environment, rotate, materials, view, active, None, bounces)
+
+    @property
+    def changed(self) -> int | None:
+        sky = self.sky
+        return len(sky.tree.cell) if sky.changed is None else sky.changed
+
+    def resume(self, previous: Path) -> None:
+        self.sky.resume(previous)
+
+    def put_light(self, writer: formats.Writer) -> None:
+        light = self.sky.light
+        assert light is not None
+        writer.put("light/flux", light.flux, dims=("cluster", "colour"), units="W sr-1 m-2 sr")
+        writer.put("light/moment", light.moment, dims=("cluster", "colour", "axis"), units="W m-2")
+        writer.put("light/irradiance", self.sky.irradiance, dims=("receiver", "colour"), units="W m-2")
+
+    @property
+    def sky(self) -> _ClusteredSky:
+        if self._sky is None:
+            self._sky = _ClusteredSky(self)
+        return self._sky
+
+    def _direct(
+        self,
+        environment: NDArray[np.float32],
+        rotate: float,
+        coats: _Coats,
+        view: NDArray[np.float32] | None,
+        looked_at: NDArray[np.bool_] | None,
+        active: NDArray[np.bool_] | None,
+        basis: str,
+    ) -> Radiance:
+        sky = self.sky
+        shines = bool(coats.shiny.any()) and view is not None
+        if shines and self._lobes is None:
+            self._lobes = _BakedLobes(self)
+        sky.set_light(environment, rotate)
+        e = (sky.irradiance + sky.of_points()).astype(np.float32)
+        lamp_e, lamps = self._lamps(coats, view, active)
+        if lamp_e is not None:
+            e += lamp_e
+        diffuse = coats.diffuse(e)
+        if not shines or view is None:
+            return Radiance(diffuse, None)
+        assert self._lobes is not None
+        specular = self._lobes.shine(sky, coats, view)
+        if lamps is not None:
+            specular += lamps
+        specular *= coats.table.parameters[coats.material][:, SPECULAR : SPECULAR + 3].astype(np.float32)
+        return Radiance(diffuse, specular)
+
+
+class _ClusteredSky:
+    """The map in clusters, and the irradiance (N, 3) float64 of all but its points.
+
+    changed: clusters whose light the last `set_light` changed, None where all were summed.
+    """
+
+    def __init__(self, lighting: ClusteredStore) -> None:
+        self.lighting = lighting
+        read: Any = lighting.store.read
+        cells = read("light_clusters/cell")
+        self.tree: Tree = build_tree(
+            [tuple(c) for c in cells.tolist()], int(lighting.store.settings["cluster_resolution"])
+        )
+        array: Any = lighting.store.array("light_clusters/fraction")
+        step = array.chunks[1]
+        columns = (np.asarray(array[:, a : a + step]) for a in range(0, array.shape[1], step))
+        self.fractions = Fractions(columns, lighting.normal)
+        self.light: LeafLight | None = None
+        self.irradiance: NDArray[np.float64] = np.zeros((len(lighting), 3))
+        self.points = Points(np.zeros((0, 3)), np.zeros((0, 3)))
+        self.changed: int | None = None
+        self._given: tuple[NDArray[np.float32], float] | None = None
+        self._rest: NDArray[np.float32] | None = None
+        self._tracer: Tracer | None = None
+        self._seen: dict[bytes, NDArray[np.bool_]] = {}
+
+    def resume(self, path: Path) -> None:
+        """Takes up the light of a radiance store that was made from the same clusters. Raises StoreError if not."""
+        previous = formats.open_store(path, "radiance")
+        if "light/moment" not in previous or previous.inputs.get("store") != self.lighting.store.fingerprint:
+            raise StoreError(f"{path}: was not made from {self.lighting.store.path}, as --from needs it")
+        read: Any = previous.read
+        self.light = LeafLight(read("light/flux"), read("light/moment"))
+        self.irradiance = read("light/irradiance")
+
+    def set_light(self, environment: NDArray[np.float32], rotate: float) -> None:
+        if self._given is not None and self._given[0] is environment and self._given[1] == rotate:
+            self.changed = 0
+            return
+        rest, self.points, _ = split_points(environment, rotate)
+        threads, old = self.lighting.threads, self.light
+        if self._rest is not None and self._given is not None and self._given[1] == rotate and old is not None:
+            rows = changed_rows(self._rest, rest) if self._rest.shape == rest.shape else None
+        else:
+            rows = None
+        if rows is not None and old is not None and self._rest is not None:
+            gone, come = (leaf_light(m, self.tree, rotate, threads, rows) for m in (self._rest, rest))
+            new = LeafLight(old.flux + (come.flux - gone.flux), old.moment + (come.moment - gone.moment))
+        else:
+            new = leaf_light(rest, self.tree, rotate, threads)
+        self._given, self._rest = (environment, rotate), rest
+        if old is not None:
+            changed = np.flatnonzero((new.moment != old.moment).any(axis=(1, 2)))
+            if len(changed) <= PARTLY * len(new.moment):
+                self.irradiance = self.irradiance + self.fractions.change(
+                    changed, old.moment[changed], new.moment[changed], threads
+                )
+                self.light, self.changed = new, len(changed)
+                return
+        self.irradiance = self.fractions.sum(new.moment, threads)
+        self.light, self.changed = new, None
+
+    def of_points(self) -> NDArray[np.float64]:
+        """Irradiance (N, 3) of the points."""
+        out = np.zeros((len(self.lighting), 3))
+        for direction, flux in zip(self.points.direction, self.points.flux, strict=True):
+            seen = np.flatnonzero(self.sees(direction))
+            cosine = np.maximum(self.lighting.normal[seen] @ direction, 0.0)
+            out[seen] += cosine[:, None] * flux
+        return out
+
+    def sees(self, direction: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Receivers that see a direction, (N,): rays where its cluster is seen in part."""
+        key = direction.tobytes()
+        if key not in self._seen:
+            fraction = self.fractions.of(int(leaves_at(self.tree, direction[None])[0]))
+            seen = fraction == 255
+            light = direction.astype(np.float32)
+            doubtful = np.flatnonzero((fraction > 0) & ~seen)
+            doubtful = doubtful[self.lighting.normal[doubtful] @ light > 0.0]
+            if "shadows" not in self.lighting.store.settings["effects"]:
+                seen[doubtful] = True
+            elif len(doubtful):
+                if self._tracer is None:
+                    self._tracer = Tracer(self.lighting.geometry.positions, self.lighting.geometry.faces)
+                tracer = self._tracer
+                origins = tracer.offset(self.lighting.position[doubtful], self.lighting.normal[doubtful])
+                seen[doubtful] = ~tracer.occluded(origins, np.tile(light, (len(doubtful), 1)))
+            self._seen[key] = seen
+            while len(self._seen) > KEPT:
+                del self._seen[next(iter(self._seen))]
+        return self._seen[key]
+
+
+class _BakedLobes:
+    """Specular light of the view that the clusters were made for, without the specular colours."""
+
+    def __init__(self, lighting: ClusteredStore) -> None:
+        self.lighting = lighting
+        store = lighting.store
+        if "light_clusters/lobe" not in store:
+            raise InputError(
+                f"{store.path}: made without a fixed view, so it has no specular lobes; cluster again with --camera"
+            )
+        read: Any = store.read
+        self.rows: NDArray[np.int64] = read("light_clusters/lobed").astype(np.int64)
+        self.view: NDArray[np.float32] = read("light_clusters/view")
+        self.table = MaterialTable(read("light_clusters/model"), read("light_clusters/parameters"))
+        self.lobes = Lobes(read("light_clusters/lobe"), read("light_clusters/lobe_scale"))
+        self._of: LeafLight | None = None
+        self._even: NDArray[np.float64] = np.zeros((len(self.rows), 3))
+
+    def shine(self, sky: _ClusteredSky, coats: _Coats, view: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(N, 3). Raises InputError for another view, or other lobes than were baked in."""
+        lighting = self.lighting
+        if not np.allclose(view[self.rows], self.view[self.rows], atol=1e-4):
+            raise InputError(
+                f"{lighting.store.path}: its specular lobes are for camera {lighting.store.settings['camera']!r} only"
+            )
+        wide = widen(coats.table, 0.5 * np.pi / lighting.resolution)
+        baked = np.zeros(len(lighting), bool)
+        baked[self.rows] = True
+        used = np.unique(coats.material[coats.shiny])
+        same = (wide.model == self.table.model) & (
+            np.delete(wide.parameters, np.s_[: SPECULAR + 3], axis=1)
+            == np.delete(self.table.parameters, np.s_[: SPECULAR + 3], axis=1)
+        ).all(axis=1)
+        if not same[used].all() or not baked[coats.shiny].all():
+            names = [list(lighting.scene.materials)[m] for m in used if not same[m]] or ["a material"]
+            raise InputError(
+                f"{', '.join(names)}: another specular lobe than the clusters were made for; its colours may change, "
+                "for other changes use the transfer store it came from"
+            )
+        assert sky.light is not None
+        if self._of is not sky.light:
+            old = np.zeros_like(sky.light.flux) if self._of is None else self._of.flux
+            changed = np.flatnonzero((sky.light.flux != old).any(axis=1))
+            if len(changed) > PARTLY * len(old):
+                changed, old = np.arange(len(old)), np.zeros_like(old)
+                self._even = np.zeros_like(self._even)
+            self._even = self._even + self.lobes.sum(changed, sky.light.flux[changed] - old[changed], lighting.threads)
+            self._of = sky.light
+        total = self._even.copy()
+        for direction, flux in zip(sky.points.direction, sky.points.flux, strict=True):
+            seen = np.packbits(sky.sees(direction), bitorder="little")
+            words = np.zeros((1, -(-len(lighting) // 64)), np.uint64)
+            words.view(np.uint8)[0, : len(seen)] = seen
+            lobe = lobe_transfer(
+                words, direction[None], lighting.normal, self.view, self.rows, coats.material, self.table
+            )[0]
+            total += lobe[:, None] * flux
+        out = np.zeros((len(lighting), 3), np.float32)
+        out[self.rows] = np.maximum(total, 0.0)
+        return out
+
+
+def changed_rows(old: NDArray[np.float32], new: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Per column of two maps (H, W, 3) the range of rows that differ, (W, 2), half open; empty where none do."""
+    rows = np.zeros((old.shape[1], 2), np.int64)
+    _changed_rows(np.ascontiguousarray(old), np.ascontiguousarray(new), rows)
+    return rows
+
+
+@njit(cache=True, nogil=True)
+def _changed_rows(old, new, rows):  # type: ignore[no-untyped-def]
+    for i in range(old.shape[0]):
+        for j in range(old.shape[1]):
+            if old[i, j, 0] != new[i, j, 0] or old[i, j, 1] != new[i, j, 1] or old[i, j, 2] != new[i, j, 2]:
+                if rows[j, 1] == 0:
+                    rows[j, 0] = i
+                rows[j, 1] = i + 1

@@ -1,0 +1,340 @@
+"""Stage cluster, of light: a transfer store in; out come its receivers with the sky in clusters of lights.
+
+The lights are the texels of a cube of any resolution. Cells of it are refined until one visible fraction per receiver
+stands for all the lights of a cell [Johan and Nishita, sec. 4]. Visibility beyond the texels of the transfer store is
+traced on demand (`core.transport.light_vectors`).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import relight_formats as formats
+from relightcli import __version__
+from relightcli.adapters.files import need_output
+from relightcli.core.brdf.models import pack_materials, widen
+from relightcli.core.lights import quadtree
+from relightcli.core.lights.latlong import LUMINANCE
+from relightcli.core.lights.quadtree import Cell
+from relightcli.core.shade.cluster_sum import GROUP
+from relightcli.core.transport.light_vectors import transpose_bits
+from relightcli.core.transport.receivers import receiver_areas
+from relightcli.errors import InputError, StoreError
+from relightcli.run import blocks as run
+from relightcli.stages.cluster import copy_arrays
+from relightcli.stages.light_cluster_job import SCRATCH, ClusterJob, ClusterWorker, as_cell
+from relightcli.stages.lighting import SHINY, LightingStore
+from relightcli.stages.outputs import resolve_camera
+
+KIND = "light_clusters"
+MOST_RESOLUTION = 4096
+EPSILON = {"rms": 0.0425, "paper": 5e-5}
+SPLIT_LEVEL = 3  # cells of this level are refined apart, each in one block
+ROUND = 64  # cells that are split in one round of a budget, at least
+CLUSTERS = 256  # per block and chunk
+RECEIVERS = 16_384  # per chunk
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that clustering light needs to know.
+
+    epsilon None: the criterion's default. lights, seconds: budgets; the cell with the largest contribution is then
+    split first. camera: fixes the view, for materials with specular lobes.
+    """
+
+    store: Path
+    output: Path
+    resolution: int = 1024
+    epsilon: float | None = None
+    criterion: str = "rms"
+    lights: int | None = None
+    seconds: float | None = None
+    camera: str | None = None
+    seed: int = 0
+    workers: int = 1
+    overwrite: bool = False
+    dry_run: bool = False
+    quiet: bool = False
+
+
+def cluster_lights(config: Config) -> dict[str, Any]:
+    """Runs the stage; returns a summary. Raises InputError, StoreError, OSError."""
+    started = time.perf_counter()
+    epsilon = _check(config)
+    need_output(config.output)
+    lighting = LightingStore(config.store, config.workers)
+    if lighting.store.kind != "transfer":
+        raise StoreError(f"{config.store}: expected a store of kind transfer, found {lighting.store.kind}.")
+    view = _fixed_view(lighting, config.camera)
+    settings = {
+        **lighting.store.settings,
+        "bounces": 0,
+        "cluster_resolution": config.resolution,
+        "criterion": config.criterion,
+        "epsilon": epsilon,
+        "lights": config.lights,
+        "seconds": config.seconds,
+        "camera": None if view is None else view[0],
+        "cluster_seed": config.seed,
+    }
+    if config.dry_run:
+        return {"dry_run": True, "receivers": len(lighting), "resolution": config.resolution, "notes": []}
+    writer = formats.begin(
+        config.output,
+        KIND,
+        settings=settings,
+        inputs={"transfer": lighting.store.fingerprint},
+        program=f"relightcli {__version__}",
+        overwrite=config.overwrite,
+    )
+    if writer is None:
+        return {"store": str(config.output), "status": "up to date", "notes": []}
+    with writer:
+        resumed = bool(writer.done)
+        writer.set_attrs(lighting.store.attrs)
+        left_out = ("visibility/", "direct/", "bounce/")
+        copy_arrays(lighting.store, writer, [n for n in lighting.store.names() if not n.startswith(left_out)])
+        _put_receivers(writer, lighting, view)
+        words = -(-len(lighting) // 64)
+        base = np.lib.format.open_memmap(
+            writer.partial_path / SCRATCH, "w+", np.uint64, (6 * lighting.resolution**2, words)
+        )
+        transpose_bits(lighting.blocks(), base)
+        base.flush()
+        shadows = "shadows" in lighting.store.settings["effects"]
+        job = ClusterJob(
+            str(writer.partial_path), config.resolution, epsilon, config.criterion, shadows, view is not None
+        )
+        if config.lights is None and config.seconds is None:
+            leaves = _refine(job, writer, config)
+        else:
+            leaves = _spend(job, writer, config)
+        leaves = _in_order(leaves, config.resolution)
+        cells = np.array(leaves, np.int32)
+        writer.put("light_clusters/cell", cells, dims=("cluster", "face_row0_row1_column0_column1"))
+        writer.put(
+            "light_clusters/solid_angle",
+            quadtree.solid_angles(cells, config.resolution),
+            dims=("cluster",),
+            units="sr",
+        )
+        _create_outputs(writer, len(leaves), len(lighting), _lobe_count(writer) if view is not None else 0)
+        run.run_blocks(
+            job,
+            run.split("fraction", len(leaves), CLUSTERS),
+            writer,
+            workers=config.workers,
+            label="clusters",
+            quiet=config.quiet,
+        )
+        if "check" not in writer.done:
+            writer.record("check", job.open().check(leaves, config.seed))
+        run.close_worker()
+        del base
+        writer.commit({"seconds": time.perf_counter() - started, "resumed": resumed, "workers": config.workers})
+    return _summary(config, started, resumed)
+
+
+def _check(config: Config) -> float:
+    if not 1 <= config.resolution <= MOST_RESOLUTION:
+        raise InputError(f"--light-resolution: expected 1 to {MOST_RESOLUTION}; found {config.resolution}")
+    if config.criterion not in EPSILON:
+        raise InputError(f"--criterion: expected {' or '.join(EPSILON)}; found {config.criterion!r}")
+    epsilon = EPSILON[config.criterion] if config.epsilon is None else config.epsilon
+    if not (0.0 <= epsilon < math.inf):
+        raise InputError(f"--epsilon: expected 0 or more; found {epsilon}")
+    if config.lights is not None and config.lights < 6:
+        raise InputError(f"--lights: expected 6 or more, one a face; found {config.lights}")
+    if config.seconds is not None and not config.seconds > 0.0:
+        raise InputError(f"--seconds: expected more than 0; found {config.seconds}")
+    return epsilon
+
+
+def _fixed_view(lighting: LightingStore, camera: str | None) -> tuple[str, NDArray[np.float32]] | None:
+    """Name of the camera and directions to it, (N, 3), where lobes are baked; None where there are none."""
+    shiny = any(m.model in SHINY and any(m.specular) for m in lighting.scene.materials.values())
+    if lighting.camera_name is not None:
+        if camera not in (None, lighting.camera_name):
+            raise InputError(f"--camera {camera}: the receivers are the pixels of camera {lighting.camera_name!r}")
+        if not shiny:
+            return None
+        view = np.zeros((len(lighting), 3), np.float32)
+        view[: lighting.pixels] = lighting.store.read("receivers/view")
+        return lighting.camera_name, view
+    if camera is None:
+        if shiny:
+            raise InputError(
+                "a material has a specular lobe, which looks different from everywhere: fix the view with --camera"
+            )
+        return None
+    eye = np.array(resolve_camera(camera, lighting.scene.cameras).eye)
+    if not shiny:
+        return None
+    d = eye - lighting.position
+    return camera, (d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-300)).astype(np.float32)
+
+
+def _put_receivers(
+    writer: formats.Writer, lighting: LightingStore, view: tuple[str, NDArray[np.float32]] | None
+) -> None:
+    """What the measure weighs receivers with, and the lobes that are baked in."""
+    if lighting.camera_name is not None:
+        area = np.zeros(len(lighting))
+        area[: lighting.pixels] = lighting.store.read("receivers/weight")
+    else:
+        assert lighting.vertex is not None
+        area = receiver_areas(lighting.geometry.positions, lighting.geometry.faces, lighting.vertex)
+    total = float(area.sum())
+    area = area / total if total > 0.0 else np.full(len(area), 1.0 / len(area))
+    materials = list(lighting.scene.materials.values())
+    of = lighting.geometry.material[lighting.object]
+    albedo = np.array([1.0 if m.adjustable else float(np.dot(m.diffuse, LUMINANCE)) for m in materials])
+    writer.put("light_clusters/area", area, dims=("receiver",))
+    writer.put("light_clusters/reflectance", albedo[of] / np.pi, dims=("receiver",), units="sr-1")
+    if view is None:
+        return
+    table = widen(pack_materials(materials), 0.5 * np.pi / lighting.resolution)
+    shiny = np.array([m.model in SHINY and any(m.specular) for m in materials])
+    writer.put("light_clusters/view", view[1], dims=("receiver", "axis"))
+    writer.put("light_clusters/lobed", np.flatnonzero(shiny[of]).astype(np.int32), dims=("lobed",))
+    writer.put("light_clusters/material", of.astype(np.int32), dims=("receiver",))
+    writer.put("light_clusters/model", table.model, dims=("material",))
+    writer.put("light_clusters/parameters", table.parameters, dims=("material", "parameter"))
+
+
+def _lobe_count(writer: formats.Writer) -> int:
+    return int(formats.worker_array(writer.partial_path, "light_clusters/lobed").shape[0])
+
+
+def _create_outputs(writer: formats.Writer, clusters: int, receivers: int, lobed: int) -> None:
+    def array(
+        name: str, dtype: Any, second: tuple[int, str] | None, description: str, units: str | None = None
+    ) -> None:
+        wide = () if second is None else (second[0],)
+        writer.array(
+            f"light_clusters/{name}",
+            shape=(clusters, *wide),
+            dtype=dtype,
+            chunks=(CLUSTERS, *(min(n, RECEIVERS) for n in wide)),
+            dims=("cluster", *(() if second is None else (second[1],))),
+            units=units,
+            attrs={"description": description},
+            codec="zstd",
+        )
+
+    array("fraction", np.uint8, (receivers, "receiver"), "visible part of the cluster, in steps of 1/255")
+    array("error", np.float32, None, "largest of the samples' errors by area-weighted RMS, 1 is a light overhead")
+    array("paper_error", np.float32, None, "largest of the samples' errors as in Johan and Nishita, Eq. 11")
+    if lobed:
+        groups = -(-lobed // GROUP)
+        array("lobe", np.uint8, (lobed, "lobed"), "transfer by the specular lobe, in steps of the group's scale")
+        array("lobe_scale", np.float32, (groups, "lobed_group"), "a step of `lobe` for 64 receivers", "sr-1")
+
+
+def _refine(job: ClusterJob, writer: formats.Writer, config: Config) -> list[Cell]:
+    """All leaves: the upper levels here, the rest in blocks of one cell each."""
+    level, leaves = quadtree.roots(config.resolution), []
+    if "roots" not in writer.done:
+        worker = job.open()
+        clock = time.perf_counter()
+        for _ in range(SPLIT_LEVEL):
+            inner = [cell for cell in level if not worker.accepts(cell)]
+            leaves += [cell for cell in level if cell not in set(inner)]
+            level = [part for cell in inner for part in quadtree.children(cell)]
+        writer.record(
+            "roots",
+            {
+                "seconds": time.perf_counter() - clock,
+                "rays": float(worker.vectors.rays),
+                "leaves": leaves,
+                "cells": level,
+            },
+        )
+    known = {block["id"]: block for block in writer.blocks}
+    leaves = [as_cell(c) for c in known["roots"]["leaves"]]
+    cells = [as_cell(c) for c in known["roots"]["cells"]]
+    if not cells:
+        return leaves
+    run.run_blocks(
+        ClusterJob(job.partial, job.resolution, job.epsilon, job.criterion, job.shadows, job.lobes, tuple(cells)),
+        run.split("refine", len(cells), 1),
+        writer,
+        workers=config.workers,
+        label="light",
+        quiet=config.quiet,
+    )
+    for block in writer.blocks:
+        if block["id"].startswith("refine/"):
+            leaves += [as_cell(c) for c in block["leaves"]]
+    return leaves
+
+
+def _spend(job: ClusterJob, writer: formats.Writer, config: Config) -> list[Cell]:
+    """Leaves within a budget of clusters or seconds: what contributes most to the error is split first."""
+    most = math.inf if config.lights is None else config.lights
+    worker: ClusterWorker | None = None
+    errors: dict[Cell, float] = {}
+    fresh, number, spent = quadtree.roots(config.resolution), 0, 0.0
+    while True:
+        block = f"round/{number:06d}"
+        if block not in writer.done:
+            worker = worker or job.open()
+            clock, rays = time.perf_counter(), worker.vectors.rays
+            found = [worker.worst(cell) for cell in fresh]
+            seconds = time.perf_counter() - clock
+            writer.record(block, {"seconds": seconds, "rays": float(worker.vectors.rays - rays), "errors": found})
+        known = next(b for b in writer.blocks if b["id"] == block)
+        spent += known["seconds"]
+        errors |= dict(zip(fresh, known["errors"], strict=True))
+        number += 1
+        # A split adds three clusters.
+        able = sorted(
+            (cell for cell, error in errors.items() if error >= job.epsilon and quadtree.lights(cell) > 1),
+            key=lambda cell: (-errors[cell] * float(quadtree.solid_angles(np.array([cell]), job.resolution)[0]), cell),
+        )
+        room = min(max(ROUND, len(errors) // 8), (most - len(errors)) // 3)
+        if not able or room < 1 or (config.seconds is not None and spent >= config.seconds):
+            return list(errors)
+        chosen = able[: int(room)]
+        for cell in chosen:
+            del errors[cell]
+        fresh = [part for cell in chosen for part in quadtree.children(cell)]
+
+
+def _in_order(leaves: list[Cell], resolution: int) -> list[Cell]:
+    """Leaves in the order of their trees, so that neighbours stay together."""
+    wanted, out = set(leaves), []
+    stack = quadtree.roots(resolution)[::-1]
+    while stack:
+        cell = stack.pop()
+        if cell in wanted:
+            out.append(cell)
+        else:
+            stack += quadtree.children(cell)[::-1]
+    return out
+
+
+def _summary(config: Config, started: float, resumed: bool) -> dict[str, Any]:
+    store = formats.open_store(config.output, KIND)
+    info = {block["id"]: block for block in store.blocks}
+    return {
+        "store": str(config.output),
+        "status": "resumed" if resumed else "written",
+        "receivers": int(store.layouts["light_clusters/area"].shape[0]),
+        "lights": 6 * config.resolution**2,
+        "light_clusters": int(store.layouts["light_clusters/cell"].shape[0]),
+        "rays": sum(block.get("rays", 0.0) for block in store.blocks),
+        "error": info["check"]["error"],
+        "bytes": sum(size.stored for size in store.sizes().values()),
+        "peak_bytes": max((block.get("peak_bytes", 0.0) for block in store.blocks), default=0.0),
+        "seconds": time.perf_counter() - started,
+        "notes": [],
+    }
