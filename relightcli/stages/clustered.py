@@ -121,7 +121,8 @@ class _ClusteredSky:
         array: Any = lighting.store.array("light_clusters/fraction")
         step = array.chunks[1]
         columns = (np.asarray(array[:, a : a + step]) for a in range(0, array.shape[1], step))
-        self.fractions = Fractions(columns, lighting.normal)
+        radius = 0.5 * np.sqrt(read("light_clusters/solid_angle"))
+        self.fractions = Fractions(columns, lighting.normal, radius)
         self.light: LeafLight | None = None
         self.irradiance: NDArray[np.float64] = np.zeros((len(lighting), 3))
         self.points = Points(np.zeros((0, 3)), np.zeros((0, 3)))
@@ -159,12 +160,10 @@ class _ClusteredSky:
         if old is not None:
             changed = np.flatnonzero((new.moment != old.moment).any(axis=(1, 2)))
             if len(changed) <= PARTLY * len(new.moment):
-                self.irradiance = self.irradiance + self.fractions.change(
-                    changed, old.moment[changed], new.moment[changed], threads
-                )
+                self.irradiance = self.irradiance + self.fractions.change(changed, old, new, threads)
                 self.light, self.changed = new, len(changed)
                 return
-        self.irradiance = self.fractions.sum(new.moment, threads)
+        self.irradiance = self.fractions.sum(new, threads)
         self.light, self.changed = new, None
 
     def of_points(self) -> NDArray[np.float64]:

@@ -21,7 +21,7 @@ from relightcli.core.shade.cluster_sum import GROUP
 from relightcli.core.sphere import cube
 from relightcli.core.transport import light_clusters as measure
 from relightcli.core.transport.light_vectors import LightVectors
-from relightcli.run import blocks as run
+from relightcli.run.blocks import Block, Info
 
 KEPT = 2_048  # transfer vectors that a process keeps for the neighbours of a cell
 CHECKS = 256  # random lights at which the clusters are compared with rays
@@ -71,10 +71,10 @@ class ClusterWorker:
         self.kept: dict[int, NDArray[np.uint64]] = {}
         self.lobes = _Lobes(self, read) if job.lobes else None
 
-    def run(self, block: run.Block) -> run.Info:
+    def run(self, block: Block) -> Info:
         rays = self.vectors.rays
         if block.id.startswith("refine/"):
-            info: run.Info = {"leaves": self.refine(self.job.cells[block.start])}
+            info: Info = {"leaves": self.refine(self.job.cells[block.start])}
         else:
             info = self.fill(block)
         return {**info, "rays": float(self.vectors.rays - rays)}
@@ -98,9 +98,9 @@ class ClusterWorker:
         """Largest error of a cell's samples: of the nine, and where those are good enough, of all that are known."""
         if quadtree.lights(cell) == 1:
             return 0.0
-        worst = float(self.errors(*self.nine(cell)).max())
+        worst = float(self.errors(cell, *self.nine(cell)).max())
         if self.job.criterion == "rms" and worst < self.job.epsilon:
-            worst = max(worst, float(self.errors(*self.known(cell)).max()))
+            worst = max(worst, float(self.errors(cell, *self.known(cell)).max()))
         return worst
 
     def nine(self, cell: Cell) -> tuple[NDArray[np.uint64], NDArray[np.float64]]:
@@ -129,18 +129,24 @@ class ClusterWorker:
             np.concatenate([directions, self.centre[face, r0:r1, c0:c1].reshape(-1, 3)]),
         )
 
-    def errors(self, visible: NDArray[np.uint64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    def errors(self, cell: Cell, visible: NDArray[np.uint64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Error of every sample by the job's criterion."""
         if self.job.criterion == "paper":
             return measure.paper_errors(visible, directions, self.normal, self.reflectance)
-        return self.rms(visible, directions)
+        return self.rms(cell, visible, directions)
 
-    def rms(self, visible: NDArray[np.uint64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    def rms(self, cell: Cell, visible: NDArray[np.uint64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Error of every sample, and of even light, by area-weighted RMS."""
+        radius = self.radius(cell)
         if self.lobes is not None:
-            return self.lobes.errors(visible, directions)
-        return np.sqrt(measure.visibility_errors(visible, directions, self.normal, self.area))
+            return self.lobes.errors(visible, directions, radius)
+        return np.sqrt(measure.visibility_errors(visible, directions, radius, self.normal, self.area))
 
-    def fill(self, block: run.Block) -> run.Info:
+    def radius(self, cell: Cell) -> float:
+        """Half the side of a cell."""
+        return 0.5 * math.sqrt(float(quadtree.solid_angles(np.array([cell]), self.job.resolution)[0]))
+
+    def fill(self, block: Block) -> Info:
         """Writes the fractions, lobes and errors of a range of leaves."""
 
         def out(name: str) -> Any:
@@ -153,8 +159,8 @@ class ClusterWorker:
         lobes, scales = [], []
         for k, cell in enumerate(cells):
             visible, directions = self.nine(cell) if self.job.criterion == "paper" else self.known(cell)
-            fraction[k] = measure.fractions(visible, directions, self.normal)
-            error[k] = self.rms(visible, directions).max()
+            fraction[k] = measure.fractions(visible, directions, self.radius(cell), self.normal)
+            error[k] = self.rms(cell, visible, directions).max()
             paper[k] = measure.paper_errors(*self.nine(cell), self.normal, self.reflectance).max()
             if self.lobes is not None:
                 lobe, scale = self.lobes.mean(visible, directions)
@@ -168,7 +174,7 @@ class ClusterWorker:
             out("lobe_scale")[rows] = np.stack(scales)
         return {"clusters": len(cells)}
 
-    def check(self, leaves: list[Cell], seed: int) -> run.Info:
+    def check(self, leaves: list[Cell], seed: int) -> Info:
         """RMS error at lights that the clusters were not made from, uniform over the sphere."""
         clock, rays = time.perf_counter(), self.vectors.rays
         d = np.random.default_rng(seed).normal(size=(CHECKS, 3))
@@ -182,8 +188,11 @@ class ClusterWorker:
             block = np.asarray(array[int(start) : int(start) + step])
             for k in np.flatnonzero((leaf >= start) & (leaf < start + step)):
                 seen = np.unpackbits(visible[k].view(np.uint8), bitorder="little")[: len(self.normal)]
-                cosine = np.maximum(self.normal @ d[k], 0.0)
-                here = float(self.area @ ((block[leaf[k] - start] / 255.0 - seen) * cosine) ** 2)
+                height = self.normal @ d[k]
+                r = self.radius(leaves[leaf[k]])
+                whole = np.where(height >= r, height, np.maximum(height + r, 0.0) ** 2 / (4.0 * r))
+                error = block[leaf[k] - start] / 255.0 * whole - seen * np.maximum(height, 0.0)
+                here = float(self.area @ error**2)
                 square, worst = square + here / CHECKS, max(worst, here)
         return {
             "seconds": time.perf_counter() - clock,
@@ -224,13 +233,16 @@ class _Lobes:
         w = self.worker
         return measure.lobe_transfer(visible, directions, w.normal, self.view, self.rows, self.material, self.table)
 
-    def errors(self, visible: NDArray[np.uint64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    def errors(
+        self, visible: NDArray[np.uint64], directions: NDArray[np.float64], radius: float
+    ) -> NDArray[np.float64]:
         w = self.worker
-        square = measure.visibility_errors(visible, directions, w.normal, self.matte)
+        square = measure.visibility_errors(visible, directions, radius, w.normal, self.matte)
         measure.add_glossy_errors(
             square,
             visible,
             directions,
+            radius,
             w.normal,
             self.rows,
             self.transfer(visible, directions),

@@ -18,6 +18,7 @@ from relightcli.core.lights.latlong import texel_solid_angles
 from relightcli.core.sphere import cube
 
 RESOLUTION = 256  # of the cube: 0.35 degrees
+WIDEST = math.radians(0.75)  # of a pixel: larger ones are no points but areas
 LEAST = 0.01  # of the map's flux
 MOST = 24
 
@@ -35,6 +36,9 @@ def split_points(
     """A map (H, W, 3) without its points, the points as they lie after a turn by `rotate_degrees` about +Y, and the
     flat indices of the pixels that went into them. The map is returned as it is if there are none."""
     height, width = radiance.shape[:2]
+    none = Points(np.zeros((0, 3)), np.zeros((0, 3)))
+    if math.pi / height > WIDEST or 2.0 * math.pi / width > WIDEST:
+        return radiance, none, np.zeros(0, np.int64)
     solid = texel_solid_angles(height, width)
     share = max(1.0, (4.0 * math.pi / (6 * RESOLUTION**2)) / float(solid.max()))
     source = np.ascontiguousarray(radiance, np.float32)
@@ -43,7 +47,6 @@ def split_points(
     least = LEAST * float(rows.sum())
     # A texel and the pixels on its rim: if it has enough, one of them has its part.
     bright = _brighter(source, solid, least / (4.0 * share + 1.0)) if least > 0.0 else np.zeros(0, np.int64)
-    none = Points(np.zeros((0, 3)), np.zeros((0, 3)))
     if len(bright) == 0:
         return radiance, none, bright
     row, column = np.divmod(bright, width)
@@ -59,11 +62,12 @@ def split_points(
     if len(chosen) == 0:
         return radiance, none, np.zeros(0, np.int64)
     mean = np.stack([np.bincount(owner, weight * d[:, x], len(texel)) for x in range(3)], axis=1)[chosen]
-    summed = np.stack([np.bincount(owner, flux[:, c], len(texel)) for c in range(3)], axis=1)[chosen]
+    summed = np.zeros((len(texel), 3))
+    np.add.at(summed, owner, flux)
     taken = bright[np.isin(owner, chosen)]
     rest = source.copy()
     rest.reshape(-1, 3)[taken] = 0.0
-    return rest, Points(mean / np.linalg.norm(mean, axis=1, keepdims=True), summed), taken
+    return rest, Points(mean / np.linalg.norm(mean, axis=1, keepdims=True), summed[chosen]), taken
 
 
 def _luminance(flux: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,9 +1,11 @@
-"""Irradiance from clusters of lights: E_i = sum_k f_ik max(0, n_i . m_k), per colour, f the visible fraction of
-cluster k at receiver i and m_k the moment of the light that it holds.
+"""Irradiance from clusters of lights: E_i = sum_k f_ik F_k g(n_i . m_k / F_k, r_k), per colour, f the visible fraction
+of cluster k at receiver i, F_k the flux and m_k the moment of the light that it holds, r_k half its side, and g the
+cosine as light about the horizon has it (`core.transport.light_clusters`).
 
 Receivers are taken 64 at a time. Where all 64 see nothing of a cluster it costs nothing; where all see all of it, its
-moment joins a sum that is the same for the 64; only what is mixed is kept in memory, a byte per receiver. Sums are
-float64: a sun of 1e6 that is added and taken away again leaves the digits of a sky of 1e-3.
+moment joins a sum that is the same for the 64 (it stands above all their horizons); only what is mixed is kept in
+memory, a byte per receiver. Sums are float64: a sun of 1e6 that is added and taken away again leaves the digits of a
+sky of 1e-3.
 """
 
 from __future__ import annotations
@@ -11,10 +13,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+
+from relightcli.core.lights.leaf_light import LeafLight
 
 GROUP = 64
 NONE, ALL = -1, -2
@@ -27,8 +32,11 @@ class Fractions:
     or NONE or ALL where it is 0 or 1 at all of them.
     """
 
-    def __init__(self, columns: Iterable[NDArray[np.uint8]], normal: NDArray[np.float32]) -> None:
-        """columns: the fractions (m, n) of runs of receivers, n a multiple of 64 but for the last."""
+    def __init__(
+        self, columns: Iterable[NDArray[np.uint8]], normal: NDArray[np.float32], radius: NDArray[np.float64]
+    ) -> None:
+        """columns: the fractions (m, n) of runs of receivers, n a multiple of 64 but for the last; normal (N, 3) unit;
+        radius (m,): r."""
         places, parts, count = [], [], 0
         for column in columns:
             place, mixed = _pack(column, count)
@@ -42,32 +50,33 @@ class Fractions:
         padded[: len(normal)] = normal
         self.normal = np.ascontiguousarray(padded.reshape(groups, GROUP, 3).transpose(0, 2, 1))
         self.count = len(normal)
+        self.radius = radius
 
-    def sum(self, moment: NDArray[np.float64], threads: int) -> NDArray[np.float64]:
-        """Irradiance (N, 3) float64 of moments (m, 3, 3): per colour, x, y, z."""
+    def sum(self, light: LeafLight, threads: int) -> NDArray[np.float64]:
+        """Irradiance (N, 3) float64."""
         out = np.zeros((len(self.place), 3, GROUP))
-        flat = moment.reshape(-1, 9)
+        flat = self._flat(light, slice(None))
         _in_parts(
             lambda a, b: _sum_all(self.place[a:b], self.mixed, self.normal[a:b], flat, out[a:b]), len(out), threads
         )
         return self._by_receiver(out)
 
-    def change(
-        self,
-        clusters: NDArray[np.int64],
-        old: NDArray[np.float64],
-        new: NDArray[np.float64],
-        threads: int,
-    ) -> NDArray[np.float64]:
-        """What E gains when the moments of some clusters go from old (k, 3, 3) to new: (N, 3) float64."""
+    def change(self, clusters: NDArray[np.int64], old: LeafLight, new: LeafLight, threads: int) -> NDArray[np.float64]:
+        """What E gains when the light of some clusters (k,) goes from old to new: (N, 3) float64."""
         out = np.zeros((len(self.place), 3, GROUP))
-        a9, b9 = old.reshape(-1, 9), new.reshape(-1, 9)
+        before, after = self._flat(old, clusters), self._flat(new, clusters)
         _in_parts(
-            lambda a, b: _change(self.place[a:b], self.mixed, self.normal[a:b], clusters, a9, b9, out[a:b]),
+            lambda a, b: _change(self.place[a:b], self.mixed, self.normal[a:b], clusters, before, after, out[a:b]),
             len(out),
             threads,
         )
         return self._by_receiver(out)
+
+    def _flat(self, light: LeafLight, chosen: Any) -> NDArray[np.float64]:
+        """Per cluster and colour: moment, r F, and 1 / (4 r F), 0 where there is no light: (k, 3, 5)."""
+        reach = light.flux[chosen] * self.radius[chosen][:, None]
+        steep = np.divide(0.25, reach, out=np.zeros_like(reach), where=reach > 0.0)
+        return np.concatenate([light.moment[chosen], reach[..., None], steep[..., None]], axis=2)
 
     def of(self, cluster: int) -> NDArray[np.uint8]:
         """One cluster's fractions, (N,), in steps of 1/255."""
@@ -131,34 +140,37 @@ def _keep(column, place, mixed, first):  # type: ignore[no-untyped-def]
                 count += 1
 
 
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
+def _spread(height, reach, steep):  # type: ignore[no-untyped-def]
+    """F g of a moment's height n . m, with r F and 1 / (4 r F)."""
+    low = max(height + reach, 0.0)
+    return height if height >= reach else low * low * steep
+
+
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def _sum_all(place, mixed, normal, moment, out):  # type: ignore[no-untyped-def]
-    whole = np.empty(9)
+def _sum_all(place, mixed, normal, light, out):  # type: ignore[no-untyped-def]
+    whole = np.empty((3, 3))
     for g in range(len(place)):
         whole[:] = 0.0
         x, y, z = normal[g, 0], normal[g, 1], normal[g, 2]
-        red, green, blue = out[g, 0], out[g, 1], out[g, 2]
         for k in range(place.shape[1]):
             p = place[g, k]
             if p == NONE:
                 continue
-            if p == ALL:
-                for q in range(9):
-                    whole[q] += moment[k, q]
-                continue
-            a, b, c = moment[k, 0], moment[k, 1], moment[k, 2]
-            d, e, f = moment[k, 3], moment[k, 4], moment[k, 5]
-            r, s, t = moment[k, 6], moment[k, 7], moment[k, 8]
-            row = mixed[p]
+            for c in range(3):
+                a, b, d, reach, steep = light[k, c, 0], light[k, c, 1], light[k, c, 2], light[k, c, 3], light[k, c, 4]
+                if p == ALL:
+                    whole[c, 0] += a
+                    whole[c, 1] += b
+                    whole[c, 2] += d
+                    continue
+                row, into = mixed[p], out[g, c]
+                for i in range(GROUP):
+                    into[i] += np.float64(row[i]) * _spread(x[i] * a + y[i] * b + z[i] * d, reach, steep)
+        for c in range(3):
+            into = out[g, c]
             for i in range(GROUP):
-                v = np.float64(row[i])
-                red[i] += v * max(x[i] * a + y[i] * b + z[i] * c, 0.0)
-                green[i] += v * max(x[i] * d + y[i] * e + z[i] * f, 0.0)
-                blue[i] += v * max(x[i] * r + y[i] * s + z[i] * t, 0.0)
-        for i in range(GROUP):
-            red[i] = red[i] / 255.0 + x[i] * whole[0] + y[i] * whole[1] + z[i] * whole[2]
-            green[i] = green[i] / 255.0 + x[i] * whole[3] + y[i] * whole[4] + z[i] * whole[5]
-            blue[i] = blue[i] / 255.0 + x[i] * whole[6] + y[i] * whole[7] + z[i] * whole[8]
+                into[i] = into[i] / 255.0 + x[i] * whole[c, 0] + y[i] * whole[c, 1] + z[i] * whole[c, 2]
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
@@ -170,8 +182,8 @@ def _change(place, mixed, normal, clusters, old, new, out):  # type: ignore[no-u
             if p == NONE:
                 continue
             for c in range(3):
-                a, b, d = old[j, 3 * c], old[j, 3 * c + 1], old[j, 3 * c + 2]
-                e, f, h = new[j, 3 * c], new[j, 3 * c + 1], new[j, 3 * c + 2]
+                a, b, d, reach, steep = old[j, c, 0], old[j, c, 1], old[j, c, 2], old[j, c, 3], old[j, c, 4]
+                e, f, h, now, sharp = new[j, c, 0], new[j, c, 1], new[j, c, 2], new[j, c, 3], new[j, c, 4]
                 into = out[g, c]
                 if p == ALL:
                     for i in range(GROUP):
@@ -179,8 +191,8 @@ def _change(place, mixed, normal, clusters, old, new, out):  # type: ignore[no-u
                 else:
                     row = mixed[p]
                     for i in range(GROUP):
-                        before = max(x[i] * a + y[i] * b + z[i] * d, 0.0)
-                        after = max(x[i] * e + y[i] * f + z[i] * h, 0.0)
+                        before = _spread(x[i] * a + y[i] * b + z[i] * d, reach, steep)
+                        after = _spread(x[i] * e + y[i] * f + z[i] * h, now, sharp)
                         into[i] += np.float64(row[i]) / 255.0 * (after - before)
 
 

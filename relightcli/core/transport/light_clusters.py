@@ -1,18 +1,21 @@
 """How well one fraction per receiver stands for all the lights of a cell of the sky, and the cells where it does.
 
-A receiver i sees the samples l of a cell (v_il = 0 or 1) at cosines c_il = max(0, n_i . w_l). Its fraction
+Unblocked, a light at the cosine x = n . w above a receiver's horizon gives x. A cell about the horizon lies partly
+below it: if x is the mean cosine of its light, and its light spread over x - r to x + r, it gives
 
-    f_i = sum_l v_il c_il / sum_l c_il,
+    g(x, r) = x for x > r,  (x + r)^2 / (4 r) for -r <= x <= r,  0 below,
 
-times the cosine of whatever light the cell will hold, is its transfer from the cell: the mean of the sampled transfer
-vectors under even light [Johan and Nishita, Eq. 10], with the cosine kept exact, so that only visibility is
-approximated. The error of sample l is
+r half the side of the cell, sqrt(solid angle) / 2. A receiver i sees the samples l of a cell (v_il = 0 or 1) at the
+cosines c_il = max(0, n_i . w_l); its transfer from the cell under even light is T_i, the mean over l of v_il c_il
+[Johan and Nishita, Eq. 10, with the reflectance left out]. Kept is the fraction f_i = T_i / g(n_i . mean of w_l, r), at
+most 1, so that f_i g is the transfer of whatever light the cell will hold, with its own direction: what is approximated
+is visibility, and not the cosine. The error of sample l is
 
-    e_l = [sum_i a_i (f_i - v_il)^2 c_il^2 / sum_i a_i]^(1/2),
+    e_l = [sum_i a_i (f_i g(n_i . w_l, r) - v_il c_il)^2 / sum_i a_i]^(1/2),
 
-a_i the receivers' areas, relative to the transfer of an unblocked light overhead. It does not depend on how finely the
-mesh is cut. The paper's own error, (11), is the L2 norm over the receivers of T_C - T_l, over their number, with T the
-reflectance times v c, and T_C its mean over the samples.
+a_i the receivers' areas, relative to the transfer of an unblocked light overhead; that under even light is judged as
+well. None depends on how finely the mesh is cut. The paper's own error, (11), is the L2 norm over the receivers of
+T_C - T_l, over their number, with T the reflectance times v c, and T_C its mean over the samples.
 
 Where the view is fixed, a receiver with a specular lobe has a second transfer, S_il = v_il times lobe times cosine, of
 which the mean over the samples is kept. Its error joins the first one's before the square, both as radiance.
@@ -29,13 +32,23 @@ from relightcli.core.brdf.models import MaterialTable, lobes_and_density
 
 
 def visibility_errors(
-    visible: NDArray[np.uint64], directions: NDArray[np.float64], normal: NDArray[np.float32], area: NDArray[np.float64]
+    visible: NDArray[np.uint64],
+    directions: NDArray[np.float64],
+    radius: float,
+    normal: NDArray[np.float32],
+    area: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """e_l^2 (S,) of the samples of a cell. visible (S, W) bits of N receivers; directions (S, 3); normal (N, 3) unit;
-    area (N,), which sum to 1."""
-    square = np.zeros(len(visible))
-    _visibility_errors(visible, np.ascontiguousarray(directions), normal, area, square)
+    """e_l^2 of the samples of a cell and, last, of even light, (S + 1,).
+
+    visible (S, W) bits of N receivers; directions (S, 3); radius r; normal (N, 3) unit; area (N,), which sum to 1.
+    """
+    square = np.zeros(len(visible) + 1)
+    _visibility_errors(visible, _with_mean(directions), radius, normal, area, square)
     return square
+
+
+def _with_mean(directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.concatenate([directions, directions.mean(axis=0)[None]])
 
 
 def paper_errors(
@@ -52,11 +65,11 @@ def paper_errors(
 
 
 def fractions(
-    visible: NDArray[np.uint64], directions: NDArray[np.float64], normal: NDArray[np.float32]
+    visible: NDArray[np.uint64], directions: NDArray[np.float64], radius: float, normal: NDArray[np.float32]
 ) -> NDArray[np.uint8]:
     """f_i (N,) of a cell in steps of 1/255."""
     out = np.zeros(len(normal), np.uint8)
-    _fractions(visible, np.ascontiguousarray(directions), normal, out)
+    _fractions(visible, _with_mean(directions), radius, normal, out)
     return out
 
 
@@ -81,6 +94,7 @@ def add_glossy_errors(
     square: NDArray[np.float64],
     visible: NDArray[np.uint64],
     directions: NDArray[np.float64],
+    radius: float,
     normal: NDArray[np.float32],
     rows: NDArray[np.int64],
     lobes: NDArray[np.float32],
@@ -88,15 +102,25 @@ def add_glossy_errors(
     specular: NDArray[np.float64],
     area: NDArray[np.float64],
 ) -> None:
-    """Adds to the squared errors (S,) those of receivers with lobes (S, n). diffuse (N,): reflectance over that of the
-    reference; specular (N,): luminance of the specular colour over the reference; area (N,) sums to 1."""
-    _add_glossy_errors(square, visible, np.ascontiguousarray(directions), normal, rows, lobes, diffuse, specular, area)
+    """Adds to the squared errors (S + 1,) those of receivers with lobes (S, n).
+
+    diffuse (N,): reflectance over that of the reference; specular (N,): luminance of the specular colour over the
+    reference; area (N,) sums to 1; the others as in `visibility_errors`.
+    """
+    _add_glossy_errors(square, visible, _with_mean(directions), radius, normal, rows, lobes, diffuse, specular, area)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _cosine(normal, i, directions, s):  # type: ignore[no-untyped-def]
-    height = normal[i, 0] * directions[s, 0] + normal[i, 1] * directions[s, 1] + normal[i, 2] * directions[s, 2]
-    return max(height, 0.0)
+def spread_cosine(x: float, r: float) -> float:
+    """g(x, r)."""
+    if x >= r:
+        return x
+    return 0.25 * (x + r) * (x + r) / r if x > -r else 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _height(normal, i, directions, s):  # type: ignore[no-untyped-def]
+    return normal[i, 0] * directions[s, 0] + normal[i, 1] * directions[s, 1] + normal[i, 2] * directions[s, 2]
 
 
 @njit(cache=True, nogil=True)
@@ -109,34 +133,37 @@ def _every_and_some(visible, w):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fraction(visible, directions, normal, i, cosines):  # type: ignore[no-untyped-def]
-    """f_i; fills the cosines, (S,)."""
+def _fraction(visible, directions, radius, normal, i, errors):  # type: ignore[no-untyped-def]
+    """f_i; fills errors (S + 1,) with f_i g - v_il c_il, and last with f_i g - T_i."""
     word, place = i >> 6, np.uint64(i & 63)
-    seen = total = 0.0
-    for s in range(len(visible)):
-        c = _cosine(normal, i, directions, s)
-        cosines[s] = c
-        total += c
+    count = len(visible)
+    mean = 0.0
+    for s in range(count):
+        errors[s] = 0.0
         if (visible[s, word] >> place) & np.uint64(1):
-            seen += c
-    return seen / total if total > 0.0 else 0.0
+            errors[s] = max(_height(normal, i, directions, s), 0.0)
+            mean += errors[s]
+    mean /= count
+    whole = spread_cosine(_height(normal, i, directions, count), radius)
+    f = min(mean / whole, 1.0) if whole > 0.0 else 0.0
+    for s in range(count):
+        errors[s] = f * spread_cosine(_height(normal, i, directions, s), radius) - errors[s]
+    errors[count] = f * whole - mean
+    return f
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _visibility_errors(visible, directions, normal, area, square):  # type: ignore[no-untyped-def]
-    cosines = np.empty(len(visible))
+def _visibility_errors(visible, directions, radius, normal, area, square):  # type: ignore[no-untyped-def]
+    errors = np.empty(len(square))
     for w in range(visible.shape[1]):
         every, some = _every_and_some(visible, w)
         mixed = every ^ some
         while mixed != np.uint64(0):
-            place = trailing_zeros(mixed)  # type: ignore
+            i = 64 * w + trailing_zeros(mixed)  # type: ignore[call-arg]
             mixed &= mixed - np.uint64(1)
-            i = 64 * w + place
-            f = _fraction(visible, directions, normal, i, cosines)
-            for s in range(len(visible)):
-                v = 1.0 if (visible[s, w] >> np.uint64(place)) & np.uint64(1) else 0.0
-                e = (f - v) * cosines[s]
-                square[s] += area[i] * e * e
+            _fraction(visible, directions, radius, normal, i, errors)
+            for s in range(len(square)):
+                square[s] += area[i] * errors[s] * errors[s]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -149,7 +176,7 @@ def _paper_errors(visible, directions, normal, reflectance, square):  # type: ig
         for s in range(count):
             t[s] = 0.0
             if (visible[s, word] >> place) & np.uint64(1):
-                t[s] = reflectance[i] * _cosine(normal, i, directions, s)
+                t[s] = reflectance[i] * max(_height(normal, i, directions, s), 0.0)
                 mean += t[s]
         mean /= count
         for s in range(count):
@@ -157,8 +184,8 @@ def _paper_errors(visible, directions, normal, reflectance, square):  # type: ig
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fractions(visible, directions, normal, out):  # type: ignore[no-untyped-def]
-    cosines = np.empty(len(visible))
+def _fractions(visible, directions, radius, normal, out):  # type: ignore[no-untyped-def]
+    errors = np.empty(len(directions))
     for w in range(visible.shape[1]):
         every, some = _every_and_some(visible, w)
         for place in range(min(64, len(out) - 64 * w)):
@@ -166,7 +193,7 @@ def _fractions(visible, directions, normal, out):  # type: ignore[no-untyped-def
             if (every >> np.uint64(place)) & np.uint64(1):
                 out[i] = 255
             elif (some >> np.uint64(place)) & np.uint64(1):
-                out[i] = np.uint8(255.0 * _fraction(visible, directions, normal, i, cosines) + 0.5)
+                out[i] = np.uint8(255.0 * _fraction(visible, directions, radius, normal, i, errors) + 0.5)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -184,17 +211,19 @@ def _lobe_transfer(visible, directions, normal, view, rows, material, model, par
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_glossy_errors(square, visible, directions, normal, rows, lobes, diffuse, specular, area):  # type: ignore[no-untyped-def]
-    cosines = np.empty(len(visible))
+def _add_glossy_errors(  # type: ignore[no-untyped-def]
+    square, visible, directions, radius, normal, rows, lobes, diffuse, specular, area
+):
+    errors = np.empty(len(square))
     for j in range(len(rows)):
         i = rows[j]
-        word, place = i >> 6, np.uint64(i & 63)
-        f = _fraction(visible, directions, normal, i, cosines)
+        _fraction(visible, directions, radius, normal, i, errors)
         mean = 0.0
         for s in range(len(visible)):
             mean += lobes[s, j]
         mean /= len(visible)
-        for s in range(len(visible)):
-            v = 1.0 if (visible[s, word] >> place) & np.uint64(1) else 0.0
-            e = diffuse[i] * (f - v) * cosines[s] + specular[i] * (mean - lobes[s, j])
+        for s in range(len(square)):
+            e = diffuse[i] * errors[s]
+            if s < len(visible):
+                e += specular[i] * (mean - lobes[s, j])
             square[s] += area[i] * e * e

@@ -112,6 +112,6 @@ def receiver_areas(
     """The part of the surface that each receiver speaks for, (N,): a third of the faces around its `vertex` (N,)."""
     corner = positions[faces]
     area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1) / 6.0
-    around = np.bincount(faces.reshape(-1), np.repeat(area, 3), len(positions))
-    out: NDArray[np.float64] = around[vertex]
-    return out
+    around = np.zeros(len(positions))
+    np.add.at(around, faces.reshape(-1), np.repeat(area, 3))
+    return around[vertex]
