@@ -29,6 +29,7 @@ NAMES = (
     "asset",
     "asset_growth",
     "direct",
+    "clusters",
 )
 PACKAGES = ("relightcli", "numpy", "numba", "zarr", "embreex", "mitsuba", "pyradiance")
 RESULTS = Path("build/bench.json")

@@ -14,14 +14,23 @@ from relightcli.cli.exits import BAD_STORE, OK
 @click.command(name="inspect")
 @click.argument("store", type=options.PATH)
 @click.option("--verify", is_flag=True, help="Read every chunk and check it; exit 3 if anything is wrong.")
+@click.option("--picture", default=None, type=options.PATH, help="Draw the clusters of lights into this picture.")
+@click.option("--env", default=None, type=options.PATH, help="Of --picture: the map under the clusters' borders.")
 @options.report
-def command(store: Path, verify: bool, as_json: bool, quiet: bool, verbose: bool) -> int:
+def command(
+    store: Path, verify: bool, picture: Path | None, env: Path | None, as_json: bool, quiet: bool, verbose: bool
+) -> int:
     """Show what STORE holds, what it cost, and whether it is sound."""
     import json
 
     from relightcli.stages.inspect import inspect
 
     result = inspect(store, verify)
+    if picture is not None:
+        import relight_formats as formats
+        from relightcli.stages.cluster_picture import draw_clusters
+
+        draw_clusters(formats.open_store(store), env, picture)
     if as_json:
         click.echo(json.dumps(result, allow_nan=False))
     elif not quiet:

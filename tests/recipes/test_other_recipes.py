@@ -1,3 +1,4 @@
+import re
 import shutil
 
 import pytest
@@ -30,3 +31,14 @@ def test_many_skies_makes_one_more_picture_for_one_more_map_and_fails_beyond_its
     strict = make("many-skies", OUT=tmp_path, LIMIT=0)
     assert strict.returncode != 0
     assert "failed: 4 of 4" in strict.stdout
+
+
+def test_light_painting_changes_some_clusters_a_stroke_and_ends_where_a_full_relighting_does(make, tmp_path):
+    done = make("light-painting", OUT=tmp_path)
+    assert done.returncode == 0, done.stderr
+    changed = [int(n) for n in re.findall(r"(\d+) clusters changed", done.stdout)]
+    assert len(changed) == 6
+    assert 0 < max(changed[1:]) < 0.3 * changed[0]
+    assert "passed" in done.stderr + done.stdout
+    assert {p.name for p in (tmp_path / "pictures").iterdir()} == {f"{k:02d}.png" for k in range(6)}
+    assert (tmp_path / "clusters.png").stat().st_size > 10_000
