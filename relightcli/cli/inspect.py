@@ -41,7 +41,9 @@ def command(
 def _text(result: dict[str, Any]) -> str:
     if not result["complete"]:
         lines = [f"{result['store']}: unfinished {result.get('kind', 'store')}"]
-        lines += [f"  {name}: {value}" for name, value in result.items() if name not in ("store", "complete", "kind")]
+        blocks = result.get("blocks", [])
+        lines += [f"  {n}: {value}" for n, value in result.items() if n not in ("store", "complete", "kind", "blocks")]
+        lines.append(f"  blocks: {len(blocks)} finished" + (f", last {blocks[-1]['id']}" if blocks else ""))
         return "\n".join(lines)
     size = options.bytes_text
     lines = [

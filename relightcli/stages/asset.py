@@ -53,7 +53,6 @@ class AssetStore(LightingStore):
         self._direct_store: DirectTensors | None = None
         self._direct_sky: SkyCube | None = None
         self._lit: tuple[NDArray[np.float32], float, SkyCube, SkyCube] | None = None
-        self._coated: tuple[dict[str, Material], _Coats] | None = None
         self._diffuse: dict[int, tuple[Factors, _Coats, Factors]] = {}
 
     def exit_radiance(
@@ -94,18 +93,13 @@ class AssetStore(LightingStore):
         return parts
 
     def _coats_of(self, materials: dict[str, Material]) -> _Coats:
-        """The receivers' materials, kept while they stay the same."""
-        if self._coated is not None and self._coated[0] == materials:
-            return self._coated[1]
-        listed = list(materials.values())
-        for material, model in zip(listed, self.made_for, strict=True):
+        for material, model in zip(materials.values(), self.made_for, strict=True):
             if material.model != model:
                 raise InputError(
                     f"material {material.name}: is {material.model} now, and the asset was made for {model}; "
                     "use the transfer store it came from"
                 )
-        self._coated = (materials, self._coats(listed))
-        return self._coated[1]
+        return super()._coats_of(materials)
 
     def _diffuse_of(self, part: int, even: Factors, coats: _Coats) -> Factors:
         """Diffuse exit radiance of a part of the light from its irradiance over pi, kept while neither changes."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 import relight_formats as formats
 from relightcli.adapters.rays import Tracer
 from relightcli.core.brdf.models import SPECULAR, MaterialTable, widen
-from relightcli.core.lights.leaf_light import LeafLight, leaf_light
+from relightcli.core.lights.leaf_light import LeafLight, Splitter
 from relightcli.core.lights.points import Points, split_points
 from relightcli.core.lights.quadtree import Tree, build_tree, leaves_at
 from relightcli.core.shade.cluster_sum import Fractions, Lobes
@@ -90,7 +90,10 @@ class ClusteredStore(LightingStore):
         if shines and self._lobes is None:
             self._lobes = _BakedLobes(self)
         sky.set_light(environment, rotate)
-        e = (sky.irradiance + sky.of_points()).astype(np.float32)
+        total = sky.irradiance
+        if len(sky.points.flux):
+            total += sky.of_points()
+        e = total.astype(np.float32)
         lamp_e, lamps = self._lamps(coats, view, active)
         if lamp_e is not None:
             e += lamp_e
@@ -106,7 +109,7 @@ class ClusteredStore(LightingStore):
 
 
 class _ClusteredSky:
-    """The map in clusters, and the irradiance (N, 3) float64 of all but its points.
+    """The map in clusters, and its points.
 
     changed: clusters whose light the last `set_light` changed, None where all were summed.
     """
@@ -124,11 +127,12 @@ class _ClusteredSky:
         radius = 0.5 * np.sqrt(read("light_clusters/solid_angle"))
         self.fractions = Fractions(columns, lighting.normal, radius)
         self.light: LeafLight | None = None
-        self.irradiance: NDArray[np.float64] = np.zeros((len(lighting), 3))
+        self._groups: NDArray[np.float64] = np.zeros((0, 3, 64))
         self.points = Points(np.zeros((0, 3)), np.zeros((0, 3)))
         self.changed: int | None = None
         self._given: tuple[NDArray[np.float32], float] | None = None
         self._rest: NDArray[np.float32] | None = None
+        self._splitter: tuple[tuple[int, int, float], Splitter] | None = None
         self._tracer: Tracer | None = None
         self._seen: dict[bytes, NDArray[np.bool_]] = {}
 
@@ -139,32 +143,45 @@ class _ClusteredSky:
             raise StoreError(f"{path}: was not made from {self.lighting.store.path}, as --from needs it")
         read: Any = previous.read
         self.light = LeafLight(read("light/flux"), read("light/moment"))
-        self.irradiance = read("light/irradiance")
+        self._groups = self.fractions.by_group(read("light/irradiance"))
 
     def set_light(self, environment: NDArray[np.float32], rotate: float) -> None:
         if self._given is not None and self._given[0] is environment and self._given[1] == rotate:
             self.changed = 0
             return
         rest, self.points, _ = split_points(environment, rotate)
+        splitter = self._splitter_of(rest.shape[0], rest.shape[1], rotate)
         threads, old = self.lighting.threads, self.light
         if self._rest is not None and self._given is not None and self._given[1] == rotate and old is not None:
             rows = changed_rows(self._rest, rest) if self._rest.shape == rest.shape else None
         else:
             rows = None
         if rows is not None and old is not None and self._rest is not None:
-            gone, come = (leaf_light(m, self.tree, rotate, threads, rows) for m in (self._rest, rest))
+            gone, come = (splitter.light(m, threads, rows) for m in (self._rest, rest))
             new = LeafLight(old.flux + (come.flux - gone.flux), old.moment + (come.moment - gone.moment))
         else:
-            new = leaf_light(rest, self.tree, rotate, threads)
+            new = splitter.light(rest, threads)
         self._given, self._rest = (environment, rotate), rest
         if old is not None:
             changed = np.flatnonzero((new.moment != old.moment).any(axis=(1, 2)))
             if len(changed) <= PARTLY * len(new.moment):
-                self.irradiance = self.irradiance + self.fractions.change(changed, old, new, threads)
+                self.fractions.change(self._groups, changed, old, new, threads)
                 self.light, self.changed = new, len(changed)
                 return
-        self.irradiance = self.fractions.sum(new, threads)
+        self._groups = self.fractions.sum(new, threads)
         self.light, self.changed = new, None
+
+    @property
+    def irradiance(self) -> NDArray[np.float64]:
+        """Irradiance (N, 3) of all but the points."""
+        return self.fractions.by_receiver(self._groups)
+
+    def _splitter_of(self, height: int, width: int, rotate: float) -> Splitter:
+        """Kept for maps of the same size, turned alike."""
+        key = (height, width, rotate)
+        if self._splitter is None or self._splitter[0] != key:
+            self._splitter = (key, Splitter(self.tree, *key))
+        return self._splitter[1]
 
     def of_points(self) -> NDArray[np.float64]:
         """Irradiance (N, 3) of the points."""

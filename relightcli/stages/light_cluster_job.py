@@ -23,6 +23,7 @@ from relightcli.core.transport import light_clusters as measure
 from relightcli.core.transport.light_vectors import LightVectors
 from relightcli.run.blocks import Block, Info
 
+JUDGED = 8_192  # receivers with lobes that a cell is judged by, about
 KEPT = 2_048  # transfer vectors that a process keeps for the neighbours of a cell
 CHECKS = 256  # random lights at which the clusters are compared with rays
 SCRATCH = "bits.partial"  # visibility by texel, while the store is written
@@ -210,6 +211,8 @@ class _Lobes:
         self.view = np.ascontiguousarray(read("light_clusters/view"), np.float32)
         self.rows = read("light_clusters/lobed").astype(np.int64)
         self.material: NDArray[np.int32] = read("light_clusters/material")
+        # Cells are judged by some receivers, evenly taken from neighbours in space, that stand for all with a lobe.
+        self.judged = self.rows[:: max(1, len(self.rows) // JUDGED)]
         self.table = MaterialTable(read("light_clusters/model"), read("light_clusters/parameters"))
         colour = self.table.parameters[:, SPECULAR : SPECULAR + 3] @ LUMINANCE
         specular = colour[self.material]
@@ -217,11 +220,16 @@ class _Lobes:
         directions = cube.texel_directions(8).reshape(-1, 3)
         every = np.full((len(directions), worker.base.shape[1]), ~np.uint64(0))
         lobe = np.zeros((len(directions), len(worker.normal)))
-        lobe[:, self.rows] = self.transfer(every, directions)
-        cosine = np.maximum(directions @ worker.normal.T, 0.0)
-        whole = worker.reflectance * cosine + specular * lobe
+        lobe[:, self.judged] = self.transfer(every, directions, self.judged)
+        whole = worker.reflectance * np.maximum(directions @ worker.normal.T, 0.0) + specular * lobe
+        area = worker.area.copy()
+        area[self.rows] = 0.0
+        area[self.judged] = worker.area[self.judged] * (
+            worker.area[self.rows].sum() / max(float(worker.area[self.judged].sum()), 1e-300)
+        )
+        self.area = area
         solid = np.tile(cube.solid_angles(8).reshape(-1), 6)
-        square = float(solid @ (whole**2 @ worker.area)) / (2.0 * np.pi)
+        square = float(solid @ (whole**2 @ area)) / (2.0 * np.pi)
         self.reference = math.sqrt(3.0 * square) if square > 0.0 else 1.0
         self.diffuse = worker.reflectance / self.reference
         self.specular = specular / self.reference
@@ -229,9 +237,12 @@ class _Lobes:
         matte[self.rows] = 0.0
         self.matte = matte
 
-    def transfer(self, visible: NDArray[np.uint64], directions: NDArray[np.float64]) -> NDArray[np.float32]:
+    def transfer(
+        self, visible: NDArray[np.uint64], directions: NDArray[np.float64], rows: NDArray[np.int64]
+    ) -> NDArray[np.float32]:
+        """Of some receivers, (S, n)."""
         w = self.worker
-        return measure.lobe_transfer(visible, directions, w.normal, self.view, self.rows, self.material, self.table)
+        return measure.lobe_transfer(visible, directions, w.normal, self.view, rows, self.material, self.table)
 
     def errors(
         self, visible: NDArray[np.uint64], directions: NDArray[np.float64], radius: float
@@ -244,11 +255,11 @@ class _Lobes:
             directions,
             radius,
             w.normal,
-            self.rows,
-            self.transfer(visible, directions),
+            self.judged,
+            self.transfer(visible, directions, self.judged),
             self.diffuse,
             self.specular,
-            w.area,
+            self.area,
         )
         return np.sqrt(square)
 
@@ -256,7 +267,7 @@ class _Lobes:
         self, visible: NDArray[np.uint64], directions: NDArray[np.float64]
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Mean transfer (n,) in steps of the scales (G,) of groups of 64."""
-        mean = self.transfer(visible, directions).mean(axis=0)
+        mean = self.transfer(visible, directions, self.rows).mean(axis=0)
         groups = -(-len(mean) // GROUP)
         padded = np.zeros(groups * GROUP, np.float32)
         padded[: len(mean)] = mean

@@ -114,6 +114,7 @@ class LightingStore:
         self.pixels = self.store.layouts["receivers/pixel"].shape[0] if "receivers/pixel" in self.store else 0
         self._gathered: dict[int, Gather] = {}
         self._seen: list[tuple[int, Gather]] | None = None
+        self._coated: tuple[dict[str, Material], _Coats] | None = None
         self._bits: Future[NDArray[np.uint8]] | None = None
         if "visibility/bits" in self.store:
             layout = self.store.layouts["visibility/bits"]
@@ -196,7 +197,7 @@ class LightingStore:
         others may get 0. basis: how diffuse light is computed; bounces: interreflections; the store's own by default.
         """
         bounces = self.bounces if bounces is None else bounces
-        coats = self._coats(list(materials.values()))
+        coats = self._coats_of(materials)
         if coats.shiny.any() and view is None:
             raise InputError("a material with a specular lobe looks different from everywhere: a --camera is needed")
         gather = self.gather(self.pixels) if bounces else None
@@ -205,6 +206,12 @@ class LightingStore:
         if gather is None:
             return [direct, *[Radiance(np.zeros_like(direct.diffuse), None)] * bounces]
         return [direct, *self._bounces(gather, direct, environment, rotate, coats, view, active, bounces)]
+
+    def _coats_of(self, materials: dict[str, Material]) -> _Coats:
+        """The receivers' materials, kept while they stay the same."""
+        if self._coated is None or self._coated[0] != materials:
+            self._coated = (materials, self._coats(list(materials.values())))
+        return self._coated[1]
 
     def _coats(self, materials: list[Material]) -> _Coats:
         material = self.geometry.material[self.object]

@@ -22,6 +22,7 @@ from relightcli.core.lights.quadtree import Tree, leaf_of_texel
 
 WIDEST = math.radians(0.36)  # of a strip
 BANDS = 8  # of strips, summed apart
+FEW = 256  # strips that are not worth cutting into bands
 
 
 class LeafLight(NamedTuple):
@@ -31,6 +32,50 @@ class LeafLight(NamedTuple):
     moment: NDArray[np.float64]
 
 
+class Splitter:
+    """Shares maps (H, W, 3) of one size, turned by `rotate_degrees` about +Y, right-handed, over a tree."""
+
+    def __init__(self, tree: Tree, height: int, width: int, rotate_degrees: float = 0.0) -> None:
+        self.tree, self.height, self.width = tree, height, width
+        turn = math.radians(math.fmod(rotate_degrees, 360.0))
+        self._column, self._borders = _strips(width, turn, tree)
+        edges = np.cos(math.pi * np.arange(height + 1) / height)[::-1].copy()  # rising s, from the south pole
+        self._row_edges = edges
+        self._row_half_angles = 0.5 * (np.arcsin(edges) + edges * np.sqrt(np.maximum(0.0, 1.0 - edges**2)))
+
+    def light(
+        self, radiance: NDArray[np.float32], threads: int = 1, rows: NDArray[np.int64] | None = None
+    ) -> LeafLight:
+        """Light of the leaves under a map.
+
+        rows (W, 2): the rows of each column, half open, that count; the others are as black. None: all. The sums do not
+        depend on `threads`.
+        """
+        source = np.ascontiguousarray(radiance, np.float32)
+        if rows is None:
+            rows = np.tile(np.array([0, self.height]), (self.width, 1))
+        strips = np.flatnonzero(rows[self._column, 1] > rows[self._column, 0])
+        south = np.ascontiguousarray(self.height - rows[:, ::-1])
+        bands = np.array_split(strips, BANDS if len(strips) > FEW else 1)
+        parts = [np.zeros((len(self.tree.cell), 3, 4)) for _ in bands]
+
+        def walk(band: NDArray[np.int64], out: NDArray[np.float64]) -> None:
+            _walk(
+                source, band, self._column, self._borders, south, self.tree,
+                self._row_edges, self._row_half_angles, half_angles_table(), out,
+            )  # fmt: skip
+
+        if len(bands) == 1:
+            walk(strips, parts[0])
+        else:
+            with ThreadPoolExecutor(max(1, threads)) as pool:
+                list(pool.map(walk, bands, parts))
+        total = parts[0]
+        for part in parts[1:]:
+            total += part
+        return LeafLight(total[:, :, 0].copy(), total[:, :, 1:].copy())
+
+
 def leaf_light(
     radiance: NDArray[np.float32],
     tree: Tree,
@@ -38,35 +83,8 @@ def leaf_light(
     threads: int = 1,
     rows: NDArray[np.int64] | None = None,
 ) -> LeafLight:
-    """Light of the leaves under a map (H, W, 3) turned by `rotate_degrees` about +Y, right-handed.
-
-    rows (W, 2): the rows of each column, half open, that count; the others are as black. None: all. The sums do not
-    depend on `threads`.
-    """
-    height, width = radiance.shape[:2]
-    turn = math.radians(math.fmod(rotate_degrees, 360.0))
-    source = np.ascontiguousarray(radiance, np.float32)
-    if rows is None:
-        rows = np.tile(np.array([0, height]), (width, 1))
-    row_edges = np.cos(math.pi * np.arange(height + 1) / height)[::-1].copy()  # rising s, from the south pole
-    row_half_angles = 0.5 * (np.arcsin(row_edges) + row_edges * np.sqrt(np.maximum(0.0, 1.0 - row_edges**2)))
-    column, borders = _strips(width, turn, tree)
-    strips = np.flatnonzero(rows[column, 1] > rows[column, 0])
-    south = np.ascontiguousarray(height - rows[:, ::-1])
-    bands = np.array_split(strips, BANDS)
-    parts = [np.zeros((len(tree.cell), 3, 4)) for _ in bands]
-    table = half_angles_table()
-    with ThreadPoolExecutor(max(1, threads)) as pool:
-        jobs = [
-            pool.submit(_walk, source, band, column, borders, south, tree, row_edges, row_half_angles, table, out)
-            for band, out in zip(bands, parts, strict=True)
-        ]
-        for job in jobs:
-            job.result()
-    total = parts[0]
-    for part in parts[1:]:
-        total += part
-    return LeafLight(total[:, :, 0].copy(), total[:, :, 1:].copy())
+    """Light of the leaves under one map; see `Splitter`."""
+    return Splitter(tree, radiance.shape[0], radiance.shape[1], rotate_degrees).light(radiance, threads, rows)
 
 
 def _strips(width: int, turn: float, tree: Tree) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

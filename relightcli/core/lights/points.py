@@ -42,11 +42,11 @@ def split_points(
     solid = texel_solid_angles(height, width)
     share = max(1.0, (4.0 * math.pi / (6 * RESOLUTION**2)) / float(solid.max()))
     source = np.ascontiguousarray(radiance, np.float32)
-    rows = np.empty(height)
-    _row_flux(source, solid, rows)
+    rows, peaks = np.empty(height), np.empty(height)
+    _row_flux(source, solid, rows, peaks)
     least = LEAST * float(rows.sum())
     # A texel and the pixels on its rim: if it has enough, one of them has its part.
-    bright = _brighter(source, solid, least / (4.0 * share + 1.0)) if least > 0.0 else np.zeros(0, np.int64)
+    bright = _brighter(source, solid, peaks, least / (4.0 * share + 1.0)) if least > 0.0 else np.zeros(0, np.int64)
     if len(bright) == 0:
         return radiance, none, bright
     row, column = np.divmod(bright, width)
@@ -75,33 +75,45 @@ def _luminance(flux: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @njit(cache=True, nogil=True)
-def _row_flux(radiance, solid, rows):  # type: ignore[no-untyped-def]
+def _row_flux(radiance, solid, rows, peaks):  # type: ignore[no-untyped-def]
+    """Luminance of the flux of every row, and of its brightest pixel."""
     for i in range(radiance.shape[0]):
-        red = green = blue = 0.0
+        total, peak = 0.0, np.float32(0.0)
         for j in range(radiance.shape[1]):
-            red += radiance[i, j, 0]
-            green += radiance[i, j, 1]
-            blue += radiance[i, j, 2]
-        rows[i] = (0.2126 * red + 0.7152 * green + 0.0722 * blue) * solid[i]
+            y = _luminance_of(radiance, i, j)
+            total += y
+            peak = max(peak, y)
+        rows[i], peaks[i] = total * solid[i], peak * solid[i]
 
 
-def _brighter(radiance: NDArray[np.float32], solid: NDArray[np.float64], least: float) -> NDArray[np.int64]:
+@njit(cache=True, nogil=True)
+def _luminance_of(radiance, i, j):  # type: ignore[no-untyped-def]
+    return (
+        np.float32(0.2126) * radiance[i, j, 0]
+        + np.float32(0.7152) * radiance[i, j, 1]
+        + np.float32(0.0722) * radiance[i, j, 2]
+    )
+
+
+def _brighter(
+    radiance: NDArray[np.float32], solid: NDArray[np.float64], peaks: NDArray[np.float64], least: float
+) -> NDArray[np.int64]:
+    """Flat indices of the pixels with so much flux."""
+    rows = np.flatnonzero(peaks >= least)
     out = np.empty(4096, np.int64)
     while True:
-        count = _find_brighter(radiance, solid, least, out)
+        count = _find_brighter(radiance, solid, rows, least, out)
         if count <= len(out):
             return out[:count]
         out = np.empty(count, np.int64)
 
 
 @njit(cache=True, nogil=True)
-def _find_brighter(radiance, solid, least, out):  # type: ignore[no-untyped-def]
+def _find_brighter(radiance, solid, rows, least, out):  # type: ignore[no-untyped-def]
     count = 0
-    for i in range(radiance.shape[0]):
-        level = least / solid[i]
+    for i in rows:
         for j in range(radiance.shape[1]):
-            y = 0.2126 * radiance[i, j, 0] + 0.7152 * radiance[i, j, 1] + 0.0722 * radiance[i, j, 2]
-            if y >= level:
+            if _luminance_of(radiance, i, j) * solid[i] >= least:
                 if count < len(out):
                     out[count] = i * radiance.shape[1] + j
                 count += 1

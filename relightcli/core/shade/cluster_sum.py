@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from relightcli.core.lights.leaf_light import LeafLight
 
 GROUP = 64
+FEW = 16  # clusters that one thread changes sooner than several start
 NONE, ALL = -1, -2
 
 
@@ -53,24 +54,34 @@ class Fractions:
         self.radius = radius
 
     def sum(self, light: LeafLight, threads: int) -> NDArray[np.float64]:
-        """Irradiance (N, 3) float64."""
+        """Irradiance by groups, (G, 3, 64) float64."""
         out = np.zeros((len(self.place), 3, GROUP))
         flat = self._flat(light, slice(None))
         _in_parts(
             lambda a, b: _sum_all(self.place[a:b], self.mixed, self.normal[a:b], flat, out[a:b]), len(out), threads
         )
-        return self._by_receiver(out)
+        return out
 
-    def change(self, clusters: NDArray[np.int64], old: LeafLight, new: LeafLight, threads: int) -> NDArray[np.float64]:
-        """What E gains when the light of some clusters (k,) goes from old to new: (N, 3) float64."""
-        out = np.zeros((len(self.place), 3, GROUP))
+    def change(
+        self, out: NDArray[np.float64], clusters: NDArray[np.int64], old: LeafLight, new: LeafLight, threads: int
+    ) -> None:
+        """Adds to irradiance (G, 3, 64) what it gains when the light of some clusters (k,) goes from old to new."""
         before, after = self._flat(old, clusters), self._flat(new, clusters)
         _in_parts(
             lambda a, b: _change(self.place[a:b], self.mixed, self.normal[a:b], clusters, before, after, out[a:b]),
             len(out),
-            threads,
+            threads if len(clusters) > FEW else 1,
         )
-        return self._by_receiver(out)
+
+    def by_receiver(self, groups: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(N, 3) of values by groups, (G, 3, 64)."""
+        return np.ascontiguousarray(groups.transpose(0, 2, 1)).reshape(-1, 3)[: self.count]
+
+    def by_group(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(G, 3, 64) of values (N, 3)."""
+        padded = np.zeros((len(self.place) * GROUP, 3))
+        padded[: self.count] = values
+        return np.ascontiguousarray(padded.reshape(-1, GROUP, 3).transpose(0, 2, 1))
 
     def _flat(self, light: LeafLight, chosen: Any) -> NDArray[np.float64]:
         """Per cluster and colour: moment, r F, and 1 / (4 r F), 0 where there is no light: (k, 3, 5)."""
@@ -86,13 +97,13 @@ class Fractions:
         out[place >= 0] = self.mixed[place[place >= 0]]
         return out.reshape(-1)[: self.count]
 
-    def _by_receiver(self, out: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.ascontiguousarray(out.transpose(0, 2, 1)).reshape(-1, 3)[: self.count]
-
 
 def _in_parts(work, count: int, threads: int) -> None:  # type: ignore[no-untyped-def]
-    cuts = np.unique(np.linspace(0, count, 4 * max(1, threads) + 1).astype(int))
-    with ThreadPoolExecutor(max(1, threads)) as pool:
+    if threads <= 1:
+        work(0, count)
+        return
+    cuts = np.unique(np.linspace(0, count, 4 * threads + 1).astype(int))
+    with ThreadPoolExecutor(threads) as pool:
         for job in [pool.submit(work, a, b) for a, b in itertools.pairwise(cuts)]:
             job.result()
 
