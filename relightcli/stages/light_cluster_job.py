@@ -249,7 +249,7 @@ class _Lobes:
     ) -> NDArray[np.float64]:
         w = self.worker
         square = measure.visibility_errors(visible, directions, radius, w.normal, self.matte)
-        measure.add_glossy_errors(
+        given = measure.add_glossy_errors(
             square,
             visible,
             directions,
@@ -261,7 +261,7 @@ class _Lobes:
             self.specular,
             self.area,
         )
-        return np.sqrt(square)
+        return np.sqrt(square / np.maximum(given, 1.0))
 
     def mean(
         self, visible: NDArray[np.uint64], directions: NDArray[np.float64]

@@ -18,7 +18,9 @@ well. None depends on how finely the mesh is cut. The paper's own error, (11), i
 T_C - T_l, over their number, with T the reflectance times v c, and T_C its mean over the samples.
 
 Where the view is fixed, a receiver with a specular lobe has a second transfer, S_il = v_il times lobe times cosine, of
-which the mean over the samples is kept. Its error joins the first one's before the square, both as radiance.
+which the mean over the samples is kept. Its error joins the first one's before the square, both as radiance. Lights
+that graze a glossy surface from behind give many times what others do: where a light gives more than the reference, its
+error is relative to what it gives.
 """
 
 from __future__ import annotations
@@ -101,13 +103,18 @@ def add_glossy_errors(
     diffuse: NDArray[np.float64],
     specular: NDArray[np.float64],
     area: NDArray[np.float64],
-) -> None:
-    """Adds to the squared errors (S + 1,) those of receivers with lobes (S, n).
+) -> NDArray[np.float64]:
+    """Adds to the squared errors (S + 1,) those of receivers with lobes (S, n); returns the mean square of what their
+    lobes give, (S + 1,).
 
     diffuse (N,): reflectance over that of the reference; specular (N,): luminance of the specular colour over the
     reference; area (N,) sums to 1; the others as in `visibility_errors`.
     """
-    _add_glossy_errors(square, visible, _with_mean(directions), radius, normal, rows, lobes, diffuse, specular, area)
+    given = np.zeros(len(square))
+    _add_glossy_errors(
+        square, given, visible, _with_mean(directions), radius, normal, rows, lobes, diffuse, specular, area
+    )
+    return given
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -212,7 +219,7 @@ def _lobe_transfer(visible, directions, normal, view, rows, material, model, par
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add_glossy_errors(  # type: ignore[no-untyped-def]
-    square, visible, directions, radius, normal, rows, lobes, diffuse, specular, area
+    square, given, visible, directions, radius, normal, rows, lobes, diffuse, specular, area
 ):
     errors = np.empty(len(square))
     for j in range(len(rows)):
@@ -224,6 +231,9 @@ def _add_glossy_errors(  # type: ignore[no-untyped-def]
         mean /= len(visible)
         for s in range(len(square)):
             e = diffuse[i] * errors[s]
+            lobe = mean
             if s < len(visible):
-                e += specular[i] * (mean - lobes[s, j])
+                lobe = lobes[s, j]
+                e += specular[i] * (mean - lobe)
             square[s] += area[i] * e * e
+            given[s] += area[i] * (specular[i] * lobe) ** 2

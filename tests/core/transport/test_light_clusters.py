@@ -126,9 +126,12 @@ def test_specular_lobes(cell):
     diffuse, specular = rng.random(N), rng.random(N)
     # Receivers whose samples agree still differ by their lobes.
     square = np.zeros(10)
-    measure.add_glossy_errors(square, pack(seen), directions, RADIUS, normal, rows, lobes, diffuse, specular, area)
+    given = measure.add_glossy_errors(
+        square, pack(seen), directions, RADIUS, normal, rows, lobes, diffuse, specular, area
+    )
     full = dense_glossy(seen, directions, normal, rows, lobes, diffuse, specular)
     np.testing.assert_allclose(square, full**2 @ area[rows], rtol=1e-4, atol=1e-20)
+    np.testing.assert_allclose(given[:-1], (specular[rows] * lobes) ** 2 @ area[rows], rtol=1e-5)
 
 
 def dense_glossy(seen, directions, normal, rows, lobes, diffuse, specular):
