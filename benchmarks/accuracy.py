@@ -30,6 +30,7 @@ VARIANTS = (
     ("dense", "R = 64", "direct/dense", ("--basis", "dense")),
 )
 QUICK = (0, 4, 7, 10)  # one of each basis
+EPSILONS = (0.16, 0.08, 0.0425)  # of clustered lights, from a store of R = 64
 REPEATS = 3
 Sky = NDArray[np.float32]
 
@@ -53,9 +54,9 @@ def truth(rank: int, count: int, points: Traceable, resolution: int, skies: list
 
 def light(store: Path, skies: list[Sky]) -> tuple[list[NDArray[np.float32]], float]:
     """Exit radiance (N, 3) under every sky, and the median seconds of one relighting."""
-    from relightcli.stages.lighting import LightingStore
+    from relightcli.stages.relight import open_lighting
 
-    lighting = LightingStore(store, cores())
+    lighting = open_lighting(store, cores())
     materials = lighting.scene.materials
 
     def relight(sky: Sky, rotate: float) -> NDArray[np.float32]:
@@ -108,6 +109,23 @@ def measure(setting: Setting) -> Report:
         errors = [100 * relative(r[rows], e) for r, e in zip(radiance, expected, strict=True)]
         table.append((basis, knob, *errors, 1e3 * seconds, stored / count, finished.seconds))
         shutil.rmtree(store)
+    assert expected is not None
+    made, _ = run_tool("precompute", scene, "-o", store, *setting.options)
+    for epsilon in EPSILONS[:1] if setting.quick else EPSILONS:
+        clusters = setting.work / "clusters.zarr"
+        finished, told = run_tool(
+            "cluster", store, "-o", clusters, "--light-resolution", "1024", "--epsilon", str(epsilon)
+        )
+        stored = sum(
+            size.stored for name, size in formats.open_store(clusters).sizes().items() if name.startswith("light_cl")
+        )
+        radiance, seconds = light(clusters, skies)
+        errors = [100 * relative(r[rows], e) for r, e in zip(radiance, expected, strict=True)]
+        knob = f"epsilon = {epsilon:g}, {told['light_clusters']:,} clusters"
+        took = made.seconds + finished.seconds
+        table.append(("clusters", knob, *errors, 1e3 * seconds, stored / count, took))
+        shutil.rmtree(clusters)
+    shutil.rmtree(store)
     report = Report(f"{subject}, {count:,} receivers, {cores()} threads")
     columns = (
         "basis",

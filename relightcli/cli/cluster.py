@@ -69,26 +69,19 @@ def command(
     common: dict[str, Any] = {"store": store, "output": output, "workers": workers or options.available_cores()}
     common |= {"quiet": quiet or as_json} | {name: settings[name] for name in ("seed", "dry_run", "overwrite")}
     asked: dict[str, Any] = {name: value for name, value in settings.items() if name in OF_LIGHTS and value is not None}
-    if set(asked) - {"criterion"} or _direct_only(store):
+    from relightcli.stages.cluster import Config, cluster, direct_only
+
+    if set(asked) - {"criterion"} or direct_only(store):
         from relightcli.stages.light_clusters import Config as LightConfig
         from relightcli.stages.light_clusters import cluster_lights
 
         options.tell(result := cluster_lights(LightConfig(**common, **asked)), _light_text(result), as_json, quiet)
         return
-    from relightcli.stages.cluster import Config, cluster
-
     of_receivers: dict[str, Any] = {name: settings[name] for name in ("clusters", "tolerance", "functions")}
     options.tell(result := cluster(Config(**common, **of_receivers)), _text(result), as_json, quiet)
 
 
 OF_LIGHTS = ("resolution", "epsilon", "criterion", "lights", "seconds", "camera")
-
-
-def _direct_only(store: Path) -> bool:
-    import relight_formats as formats
-
-    opened = formats.open_store(store)
-    return opened.kind == "transfer" and "bounce/hit" not in opened
 
 
 def _light_text(result: dict[str, Any]) -> str:

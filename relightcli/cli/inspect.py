@@ -27,10 +27,9 @@ def command(
 
     result = inspect(store, verify)
     if picture is not None:
-        import relight_formats as formats
         from relightcli.stages.cluster_picture import draw_clusters
 
-        draw_clusters(formats.open_store(store), env, picture)
+        draw_clusters(store, env, picture)
     if as_json:
         click.echo(json.dumps(result, allow_nan=False))
     elif not quiet:

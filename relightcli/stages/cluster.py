@@ -117,6 +117,12 @@ def cluster(config: Config) -> dict[str, Any]:
     }
 
 
+def direct_only(path: Path) -> bool:
+    """Whether a transfer store holds no interreflections, so that only its lights can be clustered."""
+    store = formats.open_store(path)
+    return store.kind == "transfer" and "bounce/hit" not in store
+
+
 def split_large(rows: NDArray[np.floating[Any]], label: NDArray[np.int32], most: int) -> NDArray[np.int32]:
     """Labels with every cluster of more than `most` rows cut into even parts along its first principal direction."""
     out, new = label.copy(), int(label.max()) + 1

@@ -18,8 +18,9 @@ SIZE = (512, 1024)
 BORDER = (1.0, 0.25, 0.05)
 
 
-def draw_clusters(store: formats.Store, env: Path | None, output: Path) -> None:
-    """Writes a picture of SIZE. env None: a grey map. Raises StoreError for a store of another kind."""
+def draw_clusters(path: Path, env: Path | None, output: Path) -> None:
+    """Writes a picture of SIZE of a store. env None: a grey map. Raises StoreError for a store of another kind."""
+    store = formats.open_store(path)
     if "light_clusters/cell" not in store:
         raise StoreError(f"{store.path}: holds no clustered lights to draw, which cluster --light-resolution makes")
     read: Any = store.read

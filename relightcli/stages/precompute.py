@@ -113,7 +113,7 @@ def precompute(config: Config) -> dict[str, Any]:
         "seed": config.seed,
         "bounces": bounces,
     }
-    if config.receivers != "vertices":
+    if config.pixel_grid != 1:
         settings["pixel_grid"] = config.pixel_grid
     if bounce_cells:
         settings["bounce_resolution"] = bounce_cells

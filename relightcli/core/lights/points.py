@@ -40,13 +40,13 @@ def split_points(
     if math.pi / height > WIDEST or 2.0 * math.pi / width > WIDEST:
         return radiance, none, np.zeros(0, np.int64)
     solid = texel_solid_angles(height, width)
-    share = max(1.0, (4.0 * math.pi / (6 * RESOLUTION**2)) / float(solid.max()))
     source = np.ascontiguousarray(radiance, np.float32)
     rows, peaks = np.empty(height), np.empty(height)
     _row_flux(source, solid, rows, peaks)
     least = LEAST * float(rows.sum())
-    # A texel and the pixels on its rim: if it has enough, one of them has its part.
-    bright = _brighter(source, solid, peaks, least / (4.0 * share + 1.0)) if least > 0.0 else np.zeros(0, np.int64)
+    # The mean over a texel and the pixels on its rim: if it has enough, one of them is as bright.
+    level = least / (16.0 * math.pi / (6 * RESOLUTION**2) + solid)
+    bright = _brighter(source, level, peaks) if least > 0.0 else np.zeros(0, np.int64)
     if len(bright) == 0:
         return radiance, none, bright
     row, column = np.divmod(bright, width)
@@ -76,14 +76,14 @@ def _luminance(flux: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @njit(cache=True, nogil=True)
 def _row_flux(radiance, solid, rows, peaks):  # type: ignore[no-untyped-def]
-    """Luminance of the flux of every row, and of its brightest pixel."""
+    """Luminance of the flux of every row, and of its brightest pixel's radiance."""
     for i in range(radiance.shape[0]):
         total, peak = 0.0, np.float32(0.0)
         for j in range(radiance.shape[1]):
             y = _luminance_of(radiance, i, j)
             total += y
             peak = max(peak, y)
-        rows[i], peaks[i] = total * solid[i], peak * solid[i]
+        rows[i], peaks[i] = total * solid[i], peak
 
 
 @njit(cache=True, nogil=True)
@@ -96,24 +96,24 @@ def _luminance_of(radiance, i, j):  # type: ignore[no-untyped-def]
 
 
 def _brighter(
-    radiance: NDArray[np.float32], solid: NDArray[np.float64], peaks: NDArray[np.float64], least: float
+    radiance: NDArray[np.float32], level: NDArray[np.float64], peaks: NDArray[np.float64]
 ) -> NDArray[np.int64]:
-    """Flat indices of the pixels with so much flux."""
-    rows = np.flatnonzero(peaks >= least)
+    """Flat indices of the pixels as bright as their row's level."""
+    rows = np.flatnonzero(peaks >= level)
     out = np.empty(4096, np.int64)
     while True:
-        count = _find_brighter(radiance, solid, rows, least, out)
+        count = _find_brighter(radiance, level, rows, out)
         if count <= len(out):
             return out[:count]
         out = np.empty(count, np.int64)
 
 
 @njit(cache=True, nogil=True)
-def _find_brighter(radiance, solid, rows, least, out):  # type: ignore[no-untyped-def]
+def _find_brighter(radiance, level, rows, out):  # type: ignore[no-untyped-def]
     count = 0
     for i in rows:
         for j in range(radiance.shape[1]):
-            if _luminance_of(radiance, i, j) * solid[i] >= least:
+            if _luminance_of(radiance, i, j) >= level[i]:
                 if count < len(out):
                     out[count] = i * radiance.shape[1] + j
                 count += 1

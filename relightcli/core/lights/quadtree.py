@@ -88,7 +88,11 @@ def solid_angles(cells: NDArray[np.integer], resolution: int) -> NDArray[np.floa
 
 def build_tree(leaves: Iterable[Cell], resolution: int) -> Tree:
     """The tree whose leaves are the given cells, in their order. Raises ValueError if they do not tile the faces."""
-    index = {tuple(int(x) for x in cell): k for k, cell in enumerate(leaves)}
+    index: dict[Cell, int] = {}
+    for cell in leaves:
+        if cell in index:
+            raise ValueError(f"cell {cell} is given twice")
+        index[cell] = len(index)
     cells, nodes, leaf = roots(resolution), [], []
     found = 0
     at = 0

@@ -69,7 +69,7 @@ def paper_errors(
 def fractions(
     visible: NDArray[np.uint64], directions: NDArray[np.float64], radius: float, normal: NDArray[np.float32]
 ) -> NDArray[np.uint8]:
-    """f_i (N,) of a cell in steps of 1/255."""
+    """f_i (N,) of a cell in steps of 1/255; 255 only where every sample is seen, above the horizon therefore."""
     out = np.zeros(len(normal), np.uint8)
     _fractions(visible, _with_mean(directions), radius, normal, out)
     return out
@@ -200,7 +200,7 @@ def _fractions(visible, directions, radius, normal, out):  # type: ignore[no-unt
             if (every >> np.uint64(place)) & np.uint64(1):
                 out[i] = 255
             elif (some >> np.uint64(place)) & np.uint64(1):
-                out[i] = np.uint8(255.0 * _fraction(visible, directions, radius, normal, i, errors) + 0.5)
+                out[i] = np.uint8(min(255.0 * _fraction(visible, directions, radius, normal, i, errors) + 0.5, 254.0))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

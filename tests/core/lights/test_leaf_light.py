@@ -10,6 +10,7 @@ import pytest
 from relightcli.core.lights import quadtree
 from relightcli.core.lights.environment import latlong_to_cube
 from relightcli.core.lights.leaf_light import leaf_light
+from relightcli.core.sphere import cube as sphere
 from tests.core.lights.test_quadtree import random_leaves
 from tests.core.shade.skies import patchy_map, smooth_map
 
@@ -109,3 +110,110 @@ def test_threads_give_the_same_bits():
     one, three = (leaf_light(patchy_map(3), tree, 5.0, threads=n) for n in (1, 3))
     np.testing.assert_array_equal(one.flux, three.flux)
     np.testing.assert_array_equal(one.moment, three.moment)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 2), (3, 5), (64, 128)])
+@pytest.mark.parametrize("rotate", [0.0, 77.0, -200.0, 360.0])
+@pytest.mark.parametrize("resolution", [1, 7, 50])
+def test_moments_are_exact_too(shape, rotate, resolution):
+    # What the table says of a border's latitude is added to one leaf and taken off its neighbour.
+    radiance = np.random.default_rng(8).random((*shape, 3)).astype(np.float32)
+    found = leaf_light(radiance, quadtree.build_tree(random_leaves(resolution, 8), resolution), rotate)
+    flux, moment = exact(radiance, rotate)
+    np.testing.assert_allclose(found.flux.sum(0), flux, rtol=1e-12)
+    np.testing.assert_allclose(found.moment.sum(0), moment, atol=1e-12 * flux.max())
+
+
+@pytest.mark.parametrize("rotate", [0.0, 33.0])
+def test_single_texels_of_a_noisy_map(rotate):
+    noise = np.random.default_rng(1).random((64, 128, 3)).astype(np.float32)
+    # Measured: 3.0e-4 and 1.4e-3.
+    for sky, bound in ((smooth_map(64, 128), 6e-4), (noise, 3e-3)):
+        cube = latlong_to_cube(sky, 16, rotate)
+        found = leaf_light(sky, full_tree(16), rotate)
+        assert np.abs(found.flux - cube.flux).sum() < bound * cube.flux.sum()
+
+
+@pytest.mark.parametrize("rotate", [0.0, 77.0])
+def test_suns_stay_whole(rotate):
+    height = 1024
+    tree = quadtree.build_tree(random_leaves(16, 9), 16)
+    rng = np.random.default_rng(10)
+    for _ in range(20):
+        # Not within a texel of the pole, where pixels are wedges.
+        row, column = rng.integers(60, height - 60), rng.integers(2 * height)
+        a, b = np.meshgrid([-0.01, 0.5, 1.01], [-0.01, 0.5, 1.01])
+        lat = math.pi * (0.5 - (row + a.ravel()) / height)
+        lon = math.pi * (1 - (column + b.ravel()) / height) + math.radians(rotate)
+        d = np.stack([np.sin(lon) * np.cos(lat), np.sin(lat), np.cos(lon) * np.cos(lat)], -1)
+        leaves = set(quadtree.leaves_at(tree, d).tolist())
+        sky = np.zeros((height, 2 * height, 3), np.float32)
+        sky[row, column] = (1e6, 2e6, 3e6)
+        rows = np.zeros((2 * height, 2), np.int64)
+        rows[column] = (row, row + 1)
+        found = leaf_light(sky, tree, rotate, rows=rows)
+        lit = set(np.flatnonzero(found.flux.any(axis=1)).tolist())
+        assert lit
+        assert lit <= leaves
+        if len(leaves) == 1:
+            np.testing.assert_allclose(found.flux[leaves.pop()], exact(sky)[0], rtol=1e-10)
+
+
+def test_no_rows_no_light():
+    found = leaf_light(patchy_map(4), quadtree.build_tree(random_leaves(8, 1), 8), rows=np.full((64, 2), 7))
+    assert not found.flux.any()
+    assert not found.moment.any()
+
+
+def test_splitting_a_leaf_keeps_its_light():
+    sky = np.random.default_rng(1).random((64, 128, 3)).astype(np.float32)
+    resolution = 50
+    leaves = random_leaves(resolution, 2, 200)
+    tree = quadtree.build_tree(leaves, resolution)
+    before = leaf_light(sky, tree, 20.0)
+    same, other = [], []
+    for k, cell in enumerate(leaves):
+        parts = quadtree.children(cell)
+        if not parts or k % 3:
+            continue
+        finer = quadtree.build_tree(leaves[:k] + leaves[k + 1 :] + parts, resolution)
+        after = leaf_light(sky, finer, 20.0)
+        rest = len(leaves) - 1
+        change = np.concatenate(
+            [after.flux[rest:].sum(0) - before.flux[k], (after.moment[rest:].sum(0) - before.moment[k]).ravel()]
+        )
+        change = np.abs(change).max() / before.flux[k].max()
+        if set(finer.meridian) == set(tree.meridian):
+            same.append(change)
+            np.testing.assert_array_equal(after.flux[:rest], np.delete(before.flux, k, 0))
+        else:
+            other.append(change)
+            np.testing.assert_allclose(after.flux.sum(0), before.flux.sum(0), rtol=1e-12)
+    # A border has in all of a strip the latitude of its middle. The strips are the same where no side face gets a new
+    # meridian, and then the parts are the whole; a new one cuts a strip in two, whose middles lie elsewhere.
+    assert len(same) > 10
+    assert len(other) > 3
+    assert max(same) < 1e-12
+    assert 1e-12 < max(other) < 1e-5  # measured: 4.3e-6 of the leaf's flux
+
+
+def quadrature(cell, resolution):
+    """Solid angle of a cell and the integral of the direction over it: (4,), by 40 x 40 Gauss points."""
+    face, r0, r1, c0, c1 = cell
+    x, w = np.polynomial.legendre.leggauss(40)
+    (s, ws), (t, wt) = (
+        ((a + b + (b - a) * x) / resolution - 1, w * (b - a) / resolution) for a, b in ((c0, c1), (r0, r1))
+    )
+    d = sphere.face_directions(face, s[None, :], t[:, None])
+    solid = wt[:, None] * ws[None, :] * (1 + s[None, :] ** 2 + t[:, None] ** 2) ** -1.5
+    return np.concatenate([[solid.sum()], np.einsum("ij,ijx->x", solid, d)])
+
+
+# Measured, of flux: 2.4e-6, 2.4e-6, 1.2e-5, 2.2e-4. The last are leaves of the pole faces: a corner within a strip.
+@pytest.mark.parametrize(("resolution", "bound"), [(1, 5e-6), (2, 5e-6), (3, 2.5e-5), (8, 4.4e-4)])
+def test_even_light_of_single_leaves(resolution, bound):
+    leaves = full_tree(resolution).cell
+    found = leaf_light(np.ones((1, 1, 3), np.float32), quadtree.build_tree(map(tuple, leaves.tolist()), resolution))
+    expected = np.array([quadrature(cell, resolution) for cell in leaves.tolist()])
+    np.testing.assert_allclose(found.flux[:, 0], expected[:, 0], rtol=bound)
+    np.testing.assert_allclose(found.moment[:, 2], expected[:, 1:], atol=bound * expected[:, 0].max())

@@ -9,6 +9,7 @@ import pytest
 
 from relightcli.core.lights.latlong import texel_solid_angles
 from relightcli.core.lights.points import MOST, split_points
+from relightcli.core.sphere import cube
 from tests.core.shade.skies import smooth_map
 
 
@@ -80,3 +81,80 @@ def test_no_more_than_the_brightest_few_and_none_of_a_small_part():
     assert len(split_points(sky)[1].flux) == 0
     sky[200, 200] = 9000.0
     assert len(split_points(sky)[1].flux) == 1
+
+
+@pytest.mark.parametrize("rotate", [0.0, 77.0, -400.0])
+def test_points_turn_right_handed_about_y(rotate):
+    sky = np.full((512, 1024, 3), 0.01, np.float32)
+    sky[130, 700], sky[400, 100] = (9e4, 8e4, 5e4), (2e4, 9e4, 1e4)
+    rest, still, taken = split_points(sky)
+    turned_rest, turned, turned_taken = split_points(sky, rotate)
+    c, s = math.cos(math.radians(rotate)), math.sin(math.radians(rotate))
+    about_y = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    np.testing.assert_array_equal(np.sort(taken), np.sort(turned_taken))
+    np.testing.assert_array_equal(rest, turned_rest)
+    # A turn may bring them into faces of another order.
+    one, two = np.argsort(still.flux[:, 0]), np.argsort(turned.flux[:, 0])
+    np.testing.assert_allclose(turned.direction[two], still.direction[one] @ about_y.T, atol=1e-12)
+    np.testing.assert_allclose(turned.flux[two], still.flux[one], rtol=1e-12)
+
+
+def test_a_cloudy_sky_has_no_points():
+    sky = np.kron(smooth_map() ** 3, np.ones((16, 16, 1))).astype(np.float32)
+    rest, points, taken = split_points(sky, 30.0)
+    assert rest is sky
+    assert len(points.flux) == len(taken) == 0
+
+
+def test_pixels_within_one_texel_are_one_point():
+    height = 2048
+    centre = cube.texel_directions(256)[4, 100, 60]  # texels of 4 pixels; the middle of one on +Z
+    row = round(height * (0.5 - math.asin(centre[1]) / math.pi))
+    column = round(height * (1 - math.atan2(centre[0], centre[2]) / math.pi))
+    sky = np.full((height, 2 * height, 3), 0.01, np.float32)
+    sky[row - 1 : row + 1, column - 1 : column + 1] = (1e5, 2e5, 4e5)
+    rest, points, taken = split_points(sky)
+    assert len(points.flux) == 1
+    assert len(taken) == 4
+    solid = texel_solid_angles(height, 2 * height)[row - 1 : row + 1]
+    np.testing.assert_allclose(points.flux[0], 2 * solid.sum() * np.array([1e5, 2e5, 4e5]), rtol=1e-12)
+    each = [direction_of(row + i, column + j, height) * solid[i + 1] for i in (-1, 0) for j in (-1, 0)]
+    mean = np.sum(each, axis=0)
+    np.testing.assert_allclose(points.direction[0], mean / np.linalg.norm(mean), atol=1e-12)
+    np.testing.assert_allclose(points.flux.sum(0) + flux_of(rest), flux_of(sky), rtol=1e-9)
+
+
+def test_the_brightest_are_taken_where_there_are_too_many():
+    height = 512
+    rng = np.random.default_rng(4)
+    sky = np.zeros((height, 2 * height, 3), np.float32)
+    row, column = rng.integers(100, 400, 40), np.arange(40) * 25
+    value = rng.uniform(0.6, 1.4, (40, 3))
+    sky[row, column] = value
+    rest, points, taken = split_points(sky)
+    flux = texel_solid_angles(height, 2 * height)[row, None] * sky[row, column].astype(np.float64)
+    luminance = flux @ [0.2126, 0.7152, 0.0722]
+    assert luminance.min() > 0.011 * luminance.sum()
+    best = np.argsort(-luminance)[:MOST]
+    assert len(points.flux) == MOST
+    assert set(taken.tolist()) == set((row * 2 * height + column)[best].tolist())
+    np.testing.assert_allclose(np.sort(points.flux[:, 0]), np.sort(flux[best, 0]), rtol=1e-12)
+    np.testing.assert_allclose(points.flux.sum(0) + flux_of(rest), flux_of(sky), rtol=1e-12)
+
+
+@pytest.mark.parametrize("height", [512, 2048])
+def test_a_sun_at_the_pole_keeps_all_flux(height):
+    sky = np.full((height, 2 * height, 3), 1e-3, np.float32)
+    sky[:1] = (1e5, 2e5, 3e5)
+    rest, points, taken = split_points(sky, 12.0)
+    np.testing.assert_allclose(points.flux.sum(0) + flux_of(rest), flux_of(sky), rtol=1e-9)
+    changed = np.flatnonzero((rest != sky).any(axis=2))
+    np.testing.assert_array_equal(np.sort(taken), changed)
+
+
+def test_a_sun_in_the_zenith():
+    sky = np.full((512, 1024, 3), 1e-3, np.float32)
+    sky[0] = 1e5  # 1024 narrow pixels
+    rest, points, _ = split_points(sky)
+    assert points.flux.sum() > 0.99 * flux_of(sky).sum()
+    np.testing.assert_allclose(points.flux.sum(0) + flux_of(rest), flux_of(sky), rtol=1e-9)

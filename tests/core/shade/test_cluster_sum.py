@@ -95,3 +95,94 @@ def test_lobes():
     found = Lobes(steps, scale).sum(chosen, flux, 2)
     expected = np.einsum("kn,kc->nc", (steps * np.repeat(scale.astype(np.float64), 64, axis=1)[:, :N])[chosen], flux)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("count", [1, 63, 64, 65, 300])
+def test_receivers_fill_groups_or_do_not(count):
+    steps, normal, radius, light = make(5)
+    # A lone receiver must not make ALL of a group whose light stands below its horizon.
+    steps[10:, count - 1] = np.minimum(steps[10:, count - 1], 200)
+    packed = Fractions([steps[:, :count]], normal[:count], radius)
+    found = packed.by_receiver(packed.sum(light, 1))
+    expected = dense(steps[:, :count], normal[:count], radius, light)
+    assert found.shape == (count, 3)
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * expected.max())
+
+
+@pytest.mark.parametrize("run", [64, 128, 256, 320])
+def test_runs_of_receivers_do_not_matter(run):
+    steps, normal, radius, light = make(6)
+    whole = Fractions([steps], normal, radius)
+    packed = Fractions((steps[:, a : a + run] for a in range(0, N, run)), normal, radius)
+    np.testing.assert_array_equal(packed.sum(light, 1), whole.sum(light, 1))
+    for k in range(M):
+        np.testing.assert_array_equal(packed.of(k), steps[k])
+
+
+@pytest.mark.parametrize("chosen", [[0, 3, 15, 20, 29], list(range(M))])
+def test_threads_change_the_same_bits(chosen):
+    steps, normal, radius, old = make(7)
+    packed = Fractions(columns(steps), normal, radius)
+    chosen = np.array(chosen)
+    new = LeafLight(old.flux * 1.7, old.moment * 1.7)
+    one, three = packed.sum(old, 1), packed.sum(old, 3)
+    np.testing.assert_array_equal(one, three)
+    packed.change(one, chosen, old, new, 1)
+    packed.change(three, chosen, old, new, 3)
+    np.testing.assert_array_equal(one, three)
+    picked = LeafLight(np.zeros_like(old.flux), np.zeros_like(old.moment))
+    picked.flux[chosen], picked.moment[chosen] = 0.7 * old.flux[chosen], 0.7 * old.moment[chosen]
+    expected = dense(steps, normal, radius, old) + dense(steps, normal, radius, picked)
+    np.testing.assert_allclose(packed.by_receiver(one), expected, rtol=1e-12, atol=1e-12 * expected.max())
+
+
+def test_a_cluster_may_lose_all_its_light_and_get_it_back():
+    steps, normal, radius, light = make(8)
+    packed = Fractions(columns(steps), normal, radius)
+    dark = LeafLight(np.zeros_like(light.flux), np.zeros_like(light.moment))
+    every = np.arange(M)
+    out = packed.sum(light, 1)
+    scale = out.max()
+    packed.change(out, every, light, dark, 1)
+    np.testing.assert_allclose(out, 0, atol=1e-12 * scale)
+    packed.change(out, every, dark, light, 1)
+    np.testing.assert_allclose(out, packed.sum(light, 1), atol=1e-12 * scale)
+    assert not packed.sum(dark, 1).any()
+
+
+def test_what_a_sun_leaves_behind_is_its_last_digit():
+    # A sum that has been 1e6 is rounded to 1.2e-10: 1.2e-7 of a sky of 1e-3, and no less can be asked for.
+    steps, normal, radius, light = make(9)
+    packed = Fractions(columns(steps), normal, radius)
+    faint = LeafLight(light.flux * 1e-3, light.moment * 1e-3)
+    sunny = LeafLight(faint.flux.copy(), faint.moment.copy())
+    sunny.flux[[7, 25]] += 1e6
+    sunny.moment[[7, 25]] += 1e6 * np.array([0.0, 1.0, 0.0])
+    before = packed.sum(faint, 1)
+    after = before.copy()
+    at = np.array([7, 25])
+    for _ in range(10):
+        packed.change(after, at, faint, sunny, 1)
+        packed.change(after, at, sunny, faint, 1)
+    assert np.abs(after - before).max() < 20 * np.spacing(2e6)
+
+
+def test_lobes_of_full_empty_and_unscaled_groups():
+    rng = np.random.default_rng(4)
+    groups = -(-N // 64)
+    steps = rng.integers(0, 256, (M, N)).astype(np.uint8)
+    steps[:5] = 255
+    steps[5:10] = 0
+    steps[10:15, 64:192] = 0
+    scale = rng.random((M, groups)).astype(np.float32)
+    scale[15:20], scale[20:25, ::2] = 0, 0
+    lobes = Lobes(steps, scale)
+    assert (lobes.place != ALL).all()
+    assert (lobes.place[:, 5:10] == NONE).all()
+    transfer = steps * np.repeat(scale.astype(np.float64), 64, axis=1)[:, :N]
+    flux = rng.random((M, 3)) * 10.0 ** rng.uniform(-3, 3, (M, 1))
+    for chosen in (np.arange(M), np.array([29, 0, 7, 17]), np.arange(5, 10), np.zeros(0, np.int64)):
+        expected = np.einsum("kn,kc->nc", transfer[chosen], flux[chosen])
+        found = lobes.sum(chosen, flux[chosen], 1)
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
+        np.testing.assert_array_equal(lobes.sum(chosen, flux[chosen], 3), found)

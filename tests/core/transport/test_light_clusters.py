@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 
 from relightcli.core.brdf.models import SPECULAR, evaluate_many, pack_materials
+from relightcli.core.lights import quadtree
+from relightcli.core.lights.leaf_light import LeafLight
+from relightcli.core.shade.cluster_sum import Fractions
 from relightcli.core.transport import light_clusters as measure
 from relightcli.core.transport.receivers import receiver_areas
 from relightcli.scene.model import Material
@@ -69,7 +72,7 @@ def test_errors_and_fractions(cell):
     square = measure.visibility_errors(pack(seen), directions, RADIUS, normal, area)
     np.testing.assert_allclose(square, errors**2 @ area, rtol=1e-6, atol=1e-20)
     found = measure.fractions(pack(seen), directions, RADIUS, normal)
-    np.testing.assert_array_equal(found, np.floor(255 * f + 0.5))
+    np.testing.assert_array_equal(found, np.minimum(np.floor(255 * f + 0.5), np.where(seen.all(0), 255, 254)))
     assert len(np.unique(found)) > 20
 
 
@@ -150,3 +153,82 @@ def test_areas_of_receivers_sum_to_the_mesh():
     areas = receiver_areas(positions, faces, vertex)
     assert areas.sum() == pytest.approx(6)
     np.testing.assert_allclose(areas, [1, 2, 1, 2, 0], atol=1e-12)
+
+
+def test_bits_of_lights_below_the_horizon_give_nothing():
+    # Bits as refinement may leave them: set where the light stands below the horizon.
+    rng = np.random.default_rng(11)
+    directions, normal, area = random_directions(9, 12), random_directions(N, 13).astype(np.float32), rng.random(N)
+    area /= area.sum()
+    seen = rng.random((9, N)) < 0.5
+    height = directions @ normal.T.astype(np.float64)
+    assert (seen & (height < 0)).any()
+    f, errors = dense(seen, directions, normal)
+    square = measure.visibility_errors(pack(seen), directions, RADIUS, normal, area)
+    np.testing.assert_allclose(square, errors**2 @ area, rtol=1e-6, atol=1e-20)
+    found = measure.fractions(pack(seen), directions, RADIUS, normal)
+    np.testing.assert_allclose(found, 255 * f, atol=1 + 1e-4)
+    t = seen * np.maximum(height, 0)
+    papers = measure.paper_errors(pack(seen), directions, normal, np.ones(N))
+    np.testing.assert_allclose(papers, np.sqrt(((t - t.mean(0)) ** 2).sum(1)) / N, rtol=1e-6)
+
+
+def test_what_all_samples_see_has_no_error_whatever_the_cosines():
+    directions, normal = random_directions(9, 14), random_directions(N, 15).astype(np.float32)
+    for value in (True, False):
+        seen = np.full((9, N), value)
+        assert not measure.visibility_errors(pack(seen), directions, RADIUS, normal, np.full(N, 1 / N)).any()
+        assert (measure.fractions(pack(seen), directions, RADIUS, normal) == 255 * value).all()
+
+
+@pytest.mark.parametrize("count", [1, 63, 64, 65, 130])
+def test_receivers_fill_words_or_do_not(cell, count):
+    seen, directions, normal, area = cell
+    seen, normal, area = seen[:, -count:], normal[-count:], area[-count:]
+    f, errors = dense(seen, directions, normal)
+    square = measure.visibility_errors(pack(seen), directions, RADIUS, normal, area)
+    np.testing.assert_allclose(square, errors**2 @ area, rtol=1e-6, atol=1e-20)
+    found = measure.fractions(pack(seen), directions, RADIUS, normal)
+    np.testing.assert_allclose(found, 255 * f, atol=1 + 1e-4)
+
+
+def test_receivers_without_lobes(cell):
+    seen, directions, normal, area = cell
+    table = pack_materials([Material("matt", diffuse=(0.4,) * 3), Material("shiny", "phong", specular=(0.5,) * 3)])
+    view = normal.copy()
+    rows = np.arange(N)
+    lobes = measure.lobe_transfer(pack(seen), directions, normal, view, rows, np.zeros(N, np.int32), table)
+    assert lobes.shape == (9, N)
+    assert not lobes.any()
+    # Seen from behind nothing shines.
+    assert not measure.lobe_transfer(pack(seen), directions, normal, -view, rows, np.ones(N, np.int32), table).any()
+    lit = measure.lobe_transfer(pack(seen), directions, normal, view, rows, np.ones(N, np.int32), table)
+    assert ((lit > 0) <= seen).all()
+    assert lit.any()
+    # Without lobes and of reflectance 1 what is added is the other receivers' error.
+    square = np.zeros(10)
+    given = measure.add_glossy_errors(
+        square, pack(seen), directions, RADIUS, normal, rows, lobes, np.ones(N), np.ones(N), area
+    )
+    expected = dense_glossy(seen, directions, normal, rows, lobes, np.ones(N), np.ones(N))
+    np.testing.assert_allclose(square, expected**2 @ area, rtol=1e-6, atol=1e-20)
+    assert not given.any()
+    none = np.zeros(0, np.int64)
+    empty = measure.lobe_transfer(pack(seen), directions, normal, view, none, np.zeros(N, np.int32), table)
+    square = np.full(10, 3.0)
+    measure.add_glossy_errors(square, pack(seen), directions, RADIUS, normal, none, empty, np.ones(N), np.ones(N), area)
+    np.testing.assert_array_equal(square, np.full(10, 3.0))
+
+
+def test_flat_ground_about_the_horizon_is_not_taken_for_lit_by_all():
+    # 64 receivers of one normal, a cell that is half below their horizon, its light in the lower half: none arrives.
+    n = np.tile(np.float32([-0.6593070, 0.7467942, 0.0872499]), (64, 1))
+    cell = (4, 24, 28, 44, 48)
+    _, d = quadtree.samples(cell, 64)
+    r = 0.5 * math.sqrt(float(quadtree.solid_angles(np.array([cell]), 64)[0]))
+    height = d @ n[0].astype(np.float64)
+    assert height.min() < 0 < height.max()
+    f = measure.fractions(pack(np.tile(height > 0, (64, 1)).T), d, r, n)
+    packed = Fractions([f[None]], n, np.array([r]))
+    light = LeafLight(np.ones((1, 3)), np.repeat(d[height.argmin()][None, None], 3, 1))
+    assert packed.by_receiver(packed.sum(light, 1)).min() >= 0

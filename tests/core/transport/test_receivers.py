@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from relightcli.core.transport.receivers import spatial_order, vertex_receivers
+from relightcli.core.transport.receivers import receiver_areas, spatial_order, vertex_receivers
+from tests.core.transport.scenes import sphere_grid
 
 POSITIONS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 5, 5], [0, 0, 1]], float)
 NORMALS = np.array([[0, 0, 1], [0, 1, 0], [1, 0, 0], [0, 0, 1], [0, 1, 0]], np.float32)
@@ -72,3 +73,22 @@ def test_order_of_nothing_and_of_one_plane():
     points = np.zeros((100, 3))
     points[:, 0] = np.random.default_rng(3).random(100)
     assert (np.diff(points[spatial_order(points), 0]) >= -(2.0**-20)).all()
+
+
+def test_areas_sum_to_the_mesh():
+    corners, triangles = sphere_grid(12, 24)  # its poles are rings of one point: faces without area
+    rng = np.random.default_rng(4)
+    positions = np.concatenate([corners * [1.0, 2.0, 0.5], rng.normal(size=(10, 3))])  # ten that no face uses
+    faces = np.concatenate([triangles, [[5, 5, 40], [7, 7, 7]]]).astype(np.int32)
+    a, b, c = (np.linalg.norm(positions[faces[:, i]] - positions[faces[:, i - 1]], axis=1) for i in range(3))
+    s = 0.5 * (a + b + c)
+    heron = np.sqrt(np.maximum(s * (s - a) * (s - b) * (s - c), 0))
+    found = vertex_receivers(
+        positions, np.tile(np.float32([0, 1, 0]), (len(positions), 1)), faces,
+        np.zeros(len(positions), np.int32), np.array([False]),
+    )  # fmt: skip
+    areas = receiver_areas(positions, faces, found.vertex)
+    assert areas.sum() == pytest.approx(heron.sum(), rel=1e-9)
+    for i in range(0, len(found), 31):
+        assert areas[i] == pytest.approx(heron[(faces == found.vertex[i]).any(axis=1)].sum() / 3, rel=1e-6, abs=1e-12)
+    np.testing.assert_array_equal(receiver_areas(positions, faces, np.arange(len(corners), len(positions))), 0)
