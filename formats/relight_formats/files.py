@@ -92,8 +92,13 @@ def sweep_unfinished(root: Path) -> None:
 
 
 def tree_bytes(root: Path) -> int:
-    """Sum of the sizes of all files below `root`, in bytes."""
-    return sum(e.stat(follow_symlinks=False).st_size for _, e in walk(root) if e.is_file(follow_symlinks=False))
+    """Sum of the sizes of all files below `root`, in bytes; a file that a writer renames meanwhile counts as 0."""
+    total = 0
+    for _, entry in walk(root):
+        with contextlib.suppress(FileNotFoundError):
+            if entry.is_file(follow_symlinks=False):
+                total += entry.stat(follow_symlinks=False).st_size
+    return total
 
 
 def remove_store(root: Path) -> None:
