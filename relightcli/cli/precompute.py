@@ -44,7 +44,12 @@ from relightcli.cli import options
     help="Haar: keep only as many coefficients as leave this relative RMS of a receiver's transfer out.",
 )
 @click.option("--sh-order", default=6, show_default=True, help="Bands of the spherical harmonics.")
-@click.option("--bounces", default=None, type=int, help="Interreflections. Default: what --effects names, 0 with auto.")
+@click.option(
+    "--bounces",
+    default=None,
+    type=int,
+    help="Interreflections. Default: what --effects names; auto: as many as the scene calls for.",
+)
 @click.option(
     "--bounce-resolution",
     default=None,
@@ -77,10 +82,10 @@ def command(
 def _text(result: dict[str, Any]) -> str:
     lines = [f"note: {note}" for note in result["notes"]]
     if result.get("dry_run"):
-        lines += [
-            f"{'simulate' if row['simulate'] else 'skip':9}{row['effect']:12}{row['evidence']}"
-            for row in result["plan"]
-        ]
+        for row in result["plan"]:
+            cost = row.get("predicted")
+            costs = f"{cost['seconds']:.1f} s, {options.bytes_text(cost['bytes'])}" if cost else ""
+            lines.append(f"{'simulate' if row['simulate'] else 'skip':9}{row['effect']:12}{costs:18}{row['evidence']}")
         cost = result["predicted"]
         lines.append(
             f"{result['receivers']} receivers; predicted {cost['rays'] / 1e6:.1f} million rays, "

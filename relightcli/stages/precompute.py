@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import zlib
 from dataclasses import dataclass, replace
@@ -18,9 +19,10 @@ from relightcli.adapters.rays import Tracer
 from relightcli.core.transport import visibility
 from relightcli.core.transport.hits import trace_hits
 from relightcli.core.transport.receivers import Receivers
+from relightcli.core.transport.shading import shading_scene
 from relightcli.core.transport.tessellation import tessellate
 from relightcli.errors import InputError
-from relightcli.plan import effects
+from relightcli.plan import effects, pilot
 from relightcli.run import blocks as run
 from relightcli.scene.build import build_geometry, scene_to_json
 from relightcli.scene.model import Geometry, Scene
@@ -81,7 +83,7 @@ def precompute(config: Config) -> dict[str, Any]:
     _check(config)
     need_output(config.output)
     asked = effects.parse_effects(config.effects)
-    bounces = effects.bounces_asked(asked, config.bounces)
+    wanted = effects.bounces_asked(asked, config.bounces)
     scene = load_scene(config.scene, allow_outside=config.allow_outside)
     try:
         effects.need_static({o.name: o.motion for o in scene.objects.values()}, asked)
@@ -90,19 +92,33 @@ def precompute(config: Config) -> dict[str, Any]:
     geometry = build_geometry(scene)
     both = _both_sides(scene, geometry)
     check_receivers(config.receivers, scene, geometry)
+    if wanted:
+        _check_bounces(config)
+    clock = time.perf_counter()
+    plan, bounces = effects.decide(
+        asked,
+        geometry.positions,
+        geometry.faces,
+        bool(both.any()),
+        _lobes(scene),
+        wanted,
+        scene.tolerance,
+        lambda: _Pilot(scene, geometry),
+    )
+    planning = time.perf_counter() - clock
     if bounces:
         _check_bounces(config)
-    plan = effects.decide(asked, geometry.positions, geometry.faces, bool(both.any()), _lobes(scene), bounces)
     simulated = [d.effect for d in plan if d.simulate]
     shadows = "shadows" in simulated
     bounce_cells = 0
     if "one-bounce" in simulated:
-        bounce_cells = config.bounce_resolution or (8 if config.light_resolution % 16 else 16)
+        planned = 8 if config.light_resolution % 16 else effects.bounce_cells(plan, scene.tolerance)
+        bounce_cells = config.bounce_resolution or planned
     source = geometry
     if shadows and config.subdivide and (config.receivers == "vertices" or bounce_cells):
         geometry = _subdivided(geometry)
     if config.dry_run:
-        return _dry_run(config, scene, source, geometry, both, plan, shadows, bounce_cells)
+        return _dry_run(config, scene, source, geometry, both, plan, bounces, planning, shadows, bounce_cells)
     settings = {
         "effects": simulated,
         "light_resolution": config.light_resolution,
@@ -138,7 +154,8 @@ def precompute(config: Config) -> dict[str, Any]:
         writer.set_attrs(
             {
                 "scene": scene_to_json(scene, geometry),
-                "plan": [{"effect": d.effect, "simulate": d.simulate, "evidence": d.evidence} for d in plan],
+                "plan": [_row(d) for d in plan],
+                "planning_seconds": planning,
                 "nothing_blocks": asked is None and not shadows,
             }
         )
@@ -174,6 +191,28 @@ def precompute(config: Config) -> dict[str, Any]:
         run.close_worker()
         writer.commit({"seconds": time.perf_counter() - started, "resumed": resumed, "workers": config.workers})
     return _summary(config, started, resumed, geometry)
+
+
+class _Pilot:
+    """See `plan.effects.Pilot`."""
+
+    def __init__(self, scene: Scene, geometry: Geometry) -> None:
+        self.scene = shading_scene(geometry, pilot.brightest(scene.materials.values()), scene.lights.values())
+        self.tracer = Tracer(geometry.positions, geometry.faces)
+        self.views = pilot.views(list(scene.cameras.values()), geometry.positions, geometry.faces)
+
+    def tails(self, allowed: float) -> list[pilot.Share]:
+        return pilot.tails(self.scene, self.tracer, self.views, allowed)
+
+    def shadows(self) -> pilot.Share:
+        return pilot.shadows(self.scene, self.tracer, self.views)
+
+
+def _row(decision: effects.Decision) -> dict[str, Any]:
+    """A row of the plan as it is stored; what was not measured is left out."""
+    row = {"effect": decision.effect, "simulate": decision.simulate, "evidence": decision.evidence}
+    measured = {"share": decision.share, "bound": decision.bound}
+    return row | {key: value for key, value in measured.items() if value is not None and math.isfinite(value)}
 
 
 def _check(config: Config) -> None:
@@ -302,6 +341,8 @@ def _dry_run(
     geometry: Geometry,
     both: NDArray[np.bool_],
     plan: list[effects.Decision],
+    bounces: int,
+    planning: float,
     shadows: bool,
     bounce_cells: int,
 ) -> dict[str, Any]:
@@ -311,38 +352,46 @@ def _dry_run(
     """
     receivers, _ = _receivers(config, scene, source, geometry, both, shadows, bool(bounce_cells))
     points = receivers.points if isinstance(receivers, PixelReceivers) else receivers
-    rays = seconds = packed = 0.0
+    spent = {"shadows": np.zeros(3), "one-bounce": np.zeros(3)}  # rays, seconds, bytes
     if shadows and len(points):
         tracer = Tracer(geometry.positions, geometry.faces)
         surfaces = surfaces_of(geometry, points, np.zeros(len(points), bool)) if bounce_cells else None
         starts = np.linspace(0, max(0, len(points) - visibility.GROUP), PILOT_GROUPS + 1).astype(int)
-        pilot = 0
+        pilot_receivers = 0
         for k, start in enumerate(starts):
             rows = slice(start, start + visibility.GROUP)
             clock = time.perf_counter()
             block = visibility.trace_visibility(
                 tracer, points.position[rows], points.normal[rows], config.light_resolution, config.refine, config.seed
             )
+            seen = time.perf_counter()
+            hits = None
             if surfaces is not None:
                 hits, more = trace_hits(
                     tracer, surfaces, points.position[rows], points.normal[rows], block.bits, bounce_cells, start, 0
                 )
+            end = time.perf_counter()
             if k:  # the first run pays for compilation
-                seconds += time.perf_counter() - clock
-                rays += block.rays
-                pilot += len(block.bits)
-                packed += len(zlib.compress(block.bits.tobytes(), 1))
-                if surfaces is not None:
-                    rays += more
-                    packed += len(zlib.compress(hits.tobytes(), 1))
-        rays *= len(points) / pilot
-        packed *= len(points) / pilot
-        seconds *= len(points) / pilot / max(1, config.workers)
+                pilot_receivers += len(block.bits)
+                spent["shadows"] += block.rays, seen - clock, len(zlib.compress(block.bits.tobytes(), 1))
+                if hits is not None:
+                    spent["one-bounce"] += more, end - seen, len(zlib.compress(hits.tobytes(), 1))
+        for cost in spent.values():
+            cost *= len(points) / pilot_receivers
+            cost[1] /= max(1, config.workers)
+    rays, seconds, packed = spent["shadows"] + spent["one-bounce"]
+    rows_of_plan = [_row(d) for d in plan]
+    for row in rows_of_plan:
+        if row["simulate"] and row["effect"] in spent:
+            cost = spent[row["effect"]]
+            row["predicted"] = {"rays": int(cost[0]), "seconds": float(cost[1]), "bytes": int(cost[2])}
     return {
         "dry_run": True,
         "store": str(config.output),
         "receivers": len(points),
-        "plan": [{"effect": d.effect, "simulate": d.simulate, "evidence": d.evidence} for d in plan],
+        "bounces": bounces,
+        "plan": rows_of_plan,
+        "planning_seconds": planning,
         "predicted": {"rays": int(rays), "seconds": seconds, "bytes": int(packed) + _raw_bytes(geometry, points)},
         "notes": list(geometry.notes),
     }
