@@ -206,9 +206,9 @@ def _share(
 def _mean_square(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[float, float]:
     """sum A B, and CONFIDENCE standard errors of it: the smaller of two estimates.
 
-    With s^2 = (A - B)^2 / 2 the variance of A B is 2 A B s^2 + s^4; colours come of the same paths, so that their errors
-    add up. A single path of great weight can make that far too large, because its square counts. The other one is
-    the spread of A B over the pixels, which has what the picture shows in it, not only noise.
+    With s^2 = (A - B)^2 / 2 the variance of A B is 2 A B s^2 + s^4; colours come of the same paths, so that their
+    errors add up. A single path of great weight can make that far too large, because its square counts. The other one
+    is the spread of A B over the pixels, which has what the picture shows in it, not only noise.
     """
     product, variance = a * b, 0.5 * (a - b) ** 2
     noise = np.sqrt(2.0 * np.maximum(product, 0.0) * variance + variance**2).sum(axis=1)
