@@ -20,7 +20,10 @@ from relightcli.cli import options
     help="auto, all, or names: direct,shadows,one-bounce,two-bounce,specular.",
 )
 @click.option(
-    "--light-resolution", default=64, show_default=True, help="Texels along a face of the sky cube: 16 to 256."
+    "--light-resolution",
+    default=None,
+    type=int,
+    help="Texels along a face of the sky cube: 16 to 256. Default: 64, or what --tolerance takes.",
 )
 @click.option(
     "--refine", default=4, show_default=True, help="Visibility is probed every N texels and refined; 1 traces them all."
@@ -41,8 +44,10 @@ from relightcli.cli import options
     "--tolerance",
     default=None,
     type=float,
-    help="Haar: keep only as many coefficients as leave this relative RMS of a receiver's transfer out.",
+    help="Relative RMS error of radiance to keep: settings are chosen for it, and it is measured at the end. With "
+    "--basis haar: of a receiver's transfer, that coefficients left out may cost.",
 )
+@click.option("--allow-miss", is_flag=True, help="Keep the store where its error is larger than --tolerance.")
 @click.option("--sh-order", default=6, show_default=True, help="Bands of the spherical harmonics.")
 @click.option(
     "--bounces",

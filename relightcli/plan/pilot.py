@@ -82,7 +82,7 @@ def views(cameras: Sequence[Camera], positions: NDArray[np.float64], faces: NDAr
 
 def skies(lamps: bool) -> list[tuple[str, LatLong]]:
     """Even light, suns of three heights from three sides; and lamps alone where there are any."""
-    size = (32, 64)
+    size = (128, 256)
     out = [
         ("even light", np.ones((1, 1, 3), np.float32)),
         ("sun at 15 degrees", sky_latlong(15.0, 30.0, size=size)),
@@ -107,7 +107,7 @@ def tails(scene: ShadingScene, tracer: Tracer, cameras: Sequence[Camera], allowe
                 look.trace(first, last)
     worst = [NOTHING] * (BOUNCES + 1)
     for look in looks:
-        worst = [_larger(*pair) for pair in zip(worst, look.tails(), strict=True)]
+        worst = [larger(*pair) for pair in zip(worst, look.tails(), strict=True)]
     return worst
 
 
@@ -132,14 +132,14 @@ class _Look:
 
     def tails(self) -> list[Share]:
         whole = [run.sum(axis=0) for run in self.runs]
-        last = _share(self.runs[0][BOUNCES], self.runs[1][BOUNCES], whole[0], whole[1], self.where)
+        last = share_of(self.runs[0][BOUNCES], self.runs[1][BOUNCES], whole[0], whole[1], self.where)
         mean = [sum(float(run[k].sum()) for run in self.runs) for k in (BOUNCES - 1, BOUNCES)]
         ratio = min(mean[1] / mean[0], STEEPEST) if mean[0] > 0.0 else 0.0
         grown = ratio / (1.0 - ratio)
         out = []
         for k in range(BOUNCES):
             rest = [run[k + 1 : BOUNCES].sum(axis=0) + run[BOUNCES] * (1.0 + grown) for run in self.runs]
-            out.append(_share(rest[0], rest[1], whole[0], whole[1], self.where))
+            out.append(share_of(rest[0], rest[1], whole[0], whole[1], self.where))
         return [*out, Share(last.share * grown, last.bound * grown, last.least * grown, self.where)]
 
     def needed(self, allowed: float) -> tuple[int, int]:
@@ -161,7 +161,7 @@ def shadows(scene: ShadingScene, tracer: Tracer, cameras: Sequence[Camera], seed
         pair = [_trace(scene, tracer, sky, camera, 0, seed + run, True).sum(axis=0) for run in (0, 1)]
         through = [_trace(scene, tracer, sky, camera, 0, seed + run, False).sum(axis=0) for run in (0, 1)]
         lost = [a - b for a, b in zip(through, pair, strict=True)]
-        worst = _larger(worst, _share(lost[0], lost[1], pair[0], pair[1], where))
+        worst = larger(worst, share_of(lost[0], lost[1], pair[0], pair[1], where))
     return worst
 
 
@@ -186,7 +186,7 @@ def _trace(
     return tile.layers.reshape(bounces + 2, -1, 3)
 
 
-def _share(
+def share_of(
     a: NDArray[np.float64],
     b: NDArray[np.float64],
     whole_a: NDArray[np.float64],
@@ -216,7 +216,8 @@ def _mean_square(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[float,
     return float(product.sum()), CONFIDENCE * min(float(np.linalg.norm(noise)), spread)
 
 
-def _larger(a: Share, b: Share) -> Share:
+def larger(a: Share, b: Share) -> Share:
+    """The one with the larger bound."""
     return b if b.bound > a.bound else a
 
 

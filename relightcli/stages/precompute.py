@@ -28,6 +28,7 @@ from relightcli.scene.build import build_geometry, scene_to_json
 from relightcli.scene.model import Geometry, Scene
 from relightcli.scene.parse import load_scene
 from relightcli.stages.inputs import scene_inputs
+from relightcli.stages.promise import keep_promise, try_resolutions
 from relightcli.stages.receiver_setup import (
     MOST_PIXEL_GRID,
     PixelReceivers,
@@ -45,6 +46,7 @@ from relightcli.stages.visibility_job import VisibilityJob, block_size, create_o
 
 KIND = "transfer"
 BASES = ("visibility", "haar", "sh", "dense")
+RESOLUTION = 64  # texels along a face of the light's cube, unless asked for or chosen
 PILOT_GROUPS = 24  # groups of receivers that a dry run traces
 MOST_BOUNCES = 64
 BOUNCE_RESOLUTIONS = (8, 16, 32)
@@ -57,7 +59,7 @@ class Config:
 
     scene: Path
     output: Path
-    light_resolution: int = 64
+    light_resolution: int | None = None  # 64, or what `tolerance` takes
     refine: int = 4
     effects: str = "auto"
     receivers: str = "vertices"
@@ -66,6 +68,7 @@ class Config:
     basis: str = "visibility"
     coefficients: int = 128
     tolerance: float | None = None
+    allow_miss: bool = False
     sh_order: int = 6
     bounces: int | None = None
     bounce_resolution: int | None = None
@@ -84,6 +87,7 @@ def precompute(config: Config) -> dict[str, Any]:
     need_output(config.output)
     asked = effects.parse_effects(config.effects)
     wanted = effects.bounces_asked(asked, config.bounces)
+    promise = config.tolerance if config.basis == "visibility" else None
     scene = load_scene(config.scene, allow_outside=config.allow_outside)
     try:
         effects.need_static({o.name: o.motion for o in scene.objects.values()}, asked)
@@ -102,7 +106,7 @@ def precompute(config: Config) -> dict[str, Any]:
         bool(both.any()),
         _lobes(scene),
         wanted,
-        scene.tolerance,
+        scene.tolerance if promise is None else promise,
         lambda: _Pilot(scene, geometry),
     )
     planning = time.perf_counter() - clock
@@ -112,16 +116,25 @@ def precompute(config: Config) -> dict[str, Any]:
     shadows = "shadows" in simulated
     bounce_cells = 0
     if "one-bounce" in simulated:
-        planned = 8 if config.light_resolution % 16 else effects.bounce_cells(plan, scene.tolerance)
+        coarse = (config.light_resolution or RESOLUTION) % 16
+        planned = 8 if coarse else effects.bounce_cells(plan, promise or scene.tolerance)
         bounce_cells = config.bounce_resolution or planned
     source = geometry
     if shadows and config.subdivide and (config.receivers == "vertices" or bounce_cells):
         geometry = _subdivided(geometry)
+    tried: list[tuple[int, pilot.Share]] = []
+    resolution = config.light_resolution or RESOLUTION
+    if config.light_resolution is None and promise is not None and shadows:
+        receivers, buried = _receivers(config, scene, source, geometry, both, shadows, bool(bounce_cells))
+        tried = try_resolutions(config, scene, source, geometry, receivers, buried, promise)
+        resolution = tried[-1][0]
     if config.dry_run:
-        return _dry_run(config, scene, source, geometry, both, plan, bounces, planning, shadows, bounce_cells)
-    settings = {
+        return _dry_run(
+            config, resolution, scene, source, geometry, both, plan, bounces, planning, shadows, bounce_cells
+        )
+    settings: dict[str, Any] = {
         "effects": simulated,
-        "light_resolution": config.light_resolution,
+        "light_resolution": resolution,
         "refine": config.refine if shadows else 1,
         "receivers": config.receivers,
         "subdivide": config.subdivide,
@@ -156,6 +169,7 @@ def precompute(config: Config) -> dict[str, Any]:
                 "scene": scene_to_json(scene, geometry),
                 "plan": [_row(d) for d in plan],
                 "planning_seconds": planning,
+                "tried": [{"light_resolution": r, "share": e.share, "where": e.where} for r, e in tried],
                 "nothing_blocks": asked is None and not shadows,
             }
         )
@@ -167,7 +181,7 @@ def precompute(config: Config) -> dict[str, Any]:
             put_vertex_colours(writer, geometry)
         job = VisibilityJob(
             str(writer.partial_path),
-            config.light_resolution,
+            resolution,
             config.refine,
             shadows,
             config.basis,
@@ -182,13 +196,15 @@ def precompute(config: Config) -> dict[str, Any]:
         create_outputs(writer, job, len(receivers))
         run.run_blocks(
             job,
-            run.split("visibility", len(receivers), block_size(config.light_resolution)),
+            run.split("visibility", len(receivers), block_size(resolution)),
             writer,
             workers=config.workers,
             label="visibility",
             quiet=config.quiet,
         )
         run.close_worker()
+        if promise is not None:
+            keep_promise(config, promise, resolution, scene, source, geometry, receivers, buried, writer)
         writer.commit({"seconds": time.perf_counter() - started, "resumed": resumed, "workers": config.workers})
     return _summary(config, started, resumed, geometry)
 
@@ -216,7 +232,7 @@ def _row(decision: effects.Decision) -> dict[str, Any]:
 
 
 def _check(config: Config) -> None:
-    resolution = config.light_resolution
+    resolution = config.light_resolution or RESOLUTION
     if not 16 <= resolution <= 256 or resolution % 8:
         raise InputError(f"--light-resolution: expected a multiple of 8 from 16 to 256; found {resolution}")
     if config.basis == "haar" and resolution & (resolution - 1):
@@ -242,11 +258,11 @@ def _check(config: Config) -> None:
 
 
 def _check_bounces(config: Config) -> None:
-    cells = config.bounce_resolution
-    if cells is not None and (cells not in BOUNCE_RESOLUTIONS or config.light_resolution % cells):
+    cells, resolution = config.bounce_resolution, config.light_resolution or RESOLUTION
+    if cells is not None and (cells not in BOUNCE_RESOLUTIONS or resolution % cells):
         raise InputError(
             "--bounce-resolution: expected 8, 16 or 32, and a divisor of --light-resolution "
-            f"({config.light_resolution}); found {cells}"
+            f"({resolution}); found {cells}"
         )
 
 
@@ -336,6 +352,7 @@ def _raw_bytes(geometry: Geometry, points: Receivers) -> int:
 
 def _dry_run(
     config: Config,
+    resolution: int,
     scene: Scene,
     source: Geometry,
     geometry: Geometry,
@@ -362,7 +379,7 @@ def _dry_run(
             rows = slice(start, start + visibility.GROUP)
             clock = time.perf_counter()
             block = visibility.trace_visibility(
-                tracer, points.position[rows], points.normal[rows], config.light_resolution, config.refine, config.seed
+                tracer, points.position[rows], points.normal[rows], resolution, config.refine, config.seed
             )
             seen = time.perf_counter()
             hits = None
@@ -390,6 +407,7 @@ def _dry_run(
         "store": str(config.output),
         "receivers": len(points),
         "bounces": bounces,
+        "light_resolution": resolution,
         "plan": rows_of_plan,
         "planning_seconds": planning,
         "predicted": {"rays": int(rays), "seconds": seconds, "bytes": int(packed) + _raw_bytes(geometry, points)},

@@ -59,7 +59,7 @@ EXPECTED = {
     "open box": (range(5, 9), True),
     "dark open box": (0, True),
     "matte only": (range(1, 3), True),
-    "mirror-like only": (range(2, 7), True),
+    "mirror-like only": (range(2, 9), True),
     "black": (0, True),
     "pebble": (0, False),
     "night": (range(1, 3), True),
