@@ -1,7 +1,7 @@
 """Reflection by a 1D kernel as a matrix of spherical harmonics: a surface's shade from visibility and light.
 
-A 1D BRDF times the cosine is g(t), t the cosine between the light and an axis R: the mirrored view for phong, the normal
-for lambert. With visibility V = sum v_j y_j and light L = sum l_i y_i
+A 1D BRDF times the cosine is g(t), t the cosine between the light and an axis R: the mirrored view for phong, the
+normal for lambert. With visibility V = sum v_j y_j and light L = sum l_i y_i
 
     shade = int L V g(s . R) ds = l' M v,    M_ij = int g(s . R) y_i y_j ds.
 
@@ -76,7 +76,7 @@ def _root(square: Fraction) -> float:
 
 
 def _norm2(band: int, m: int) -> Fraction:
-    """4 pi K^2, times 2 for m > 0 and with the mean of cos^2 over the circle, 1 or 1/2: (2 l + 1) (l - m)! / (l + m)!."""
+    """(2 l + 1) (l - m)! / (l + m)!, 4 pi times the square of the norm K. For m > 0 the 2 of it meets cos^2's mean."""
     return Fraction((2 * band + 1) * math.factorial(band - m), math.factorial(band + m))
 
 
@@ -96,7 +96,7 @@ def _associated(band: int, m: int) -> tuple[Fraction, ...]:
 
 def _sine_power(m: int) -> tuple[Fraction, ...]:
     """(1 - z^2)^m."""
-    out = (Fraction(1),)
+    out: tuple[Fraction, ...] = (Fraction(1),)
     for _ in range(m):
         out = _times(out, (Fraction(1), Fraction(0), Fraction(-1)))
     return out

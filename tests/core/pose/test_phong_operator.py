@@ -21,8 +21,9 @@ EXPONENTS = [0.0, 0.5, 1.0, 2.0, 10.0, 100.0, 1e4, 1e6]
 def _quadrature(exponent: float, order: int) -> np.ndarray:
     """M^a by integrating the harmonics themselves over z in [0, 1].
 
-    Gauss's rule for the weight (1 - z)^m z^a takes the exponent, so that no node of a huge one has to resolve the peak,
-    and the factor of (1 - z^2)^m by which entries of high m are small. The rest is a polynomial, of degree below 2 order.
+    Gauss's rule for the weight (1 - z)^m z^a takes the exponent, so that no node of a huge one has to resolve the
+    peak, and the factor of (1 - z^2)^m by which entries of high m are small. The rest is a polynomial, of degree below
+    2 order.
     """
     out = np.zeros((order**2, order**2))
     for m in range(order):
@@ -59,7 +60,7 @@ def _polynomial(band: int, m: int, z: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("exponent", EXPONENTS)
 def test_entries_equal_quadrature(exponent: float) -> None:
-    """1e-10 is the demanded bound. Beside it 1e-13 of what the norms allow: some entries are exactly 0, as 02 at a = 0."""
+    """1e-10 is the demanded bound. Beside it 1e-13 of what the norms allow: some entries are exactly 0."""
     for order in range(1, 9):
         ours, theirs = phong_matrix(exponent, order), _quadrature(exponent, order)
         most = np.sqrt(np.outer(np.diag(theirs), np.diag(theirs)))  # Cauchy and Schwarz
