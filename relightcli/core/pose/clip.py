@@ -147,21 +147,23 @@ def rotation_vector(q: F64) -> F64:
     return np.asarray(q[..., :3] * np.where(sine > 1e-12, angle / np.where(sine > 1e-12, sine, 1.0), 2.0))
 
 
-def unwrap_vectors(vectors: F64, start: F64) -> F64:
-    """Rotation vectors (M, 3) of a motion, each moved by whole turns about its own axis to be near the one before.
+def nearest_turn(vectors: F64, references: F64) -> F64:
+    """Rotation vectors (M, 3), each moved by whole turns about its own axis to be nearest to its reference (M, 3)."""
+    length = np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True))
+    along = np.where(length > 1e-12, vectors, references)  # at no rotation every axis is as good
+    size = np.sqrt((along * along).sum(axis=-1, keepdims=True))
+    axis = along / np.where(size > 1e-12, size, 1.0)
+    turns = np.rint(((references - vectors) * axis).sum(axis=-1, keepdims=True) / (2.0 * np.pi))
+    return np.asarray(vectors + 2.0 * np.pi * turns * axis)
 
-    start (3,): what the first is to be near to. The result is continuous in time where the motion is, unless it
-    leaves a full turn away from rest about another axis than it came there by: no rotation vectors are, there.
+
+def unwrap_vectors(vectors: F64) -> F64:
+    """Rotation vectors (M, 3) of a motion, each moved by whole turns to be nearest to the one before.
+
+    The result is continuous in time where the motion is, unless it leaves a full turn away from rest about another
+    axis than it came there by: no rotation vectors are, there.
     """
-    out = np.empty_like(vectors)
-    reference = start
-    for i, vector in enumerate(vectors):
-        length = float(np.sqrt(vector @ vector))
-        # At no rotation every axis is as good: that of the reference.
-        along = vector if length > 1e-12 else reference
-        size = float(np.sqrt(along @ along))
-        if size > 1e-12:
-            axis = along / size
-            vector = vector + 2.0 * np.pi * np.rint((reference - vector) @ axis / (2.0 * np.pi)) * axis
-        out[i] = reference = vector
+    out = vectors.copy()
+    for i in range(1, len(out)):
+        out[i] = nearest_turn(vectors[i : i + 1], out[i - 1 : i])[0]
     return out

@@ -21,6 +21,7 @@ from relightcli.core.pose.clip import (
     Clip,
     conjugate,
     multiply,
+    nearest_turn,
     rotation_matrix,
     rotation_vector,
     sample,
@@ -194,24 +195,29 @@ def pose_features(rig: Rig, clip: Clip | None, seconds: float = 0.0) -> F64:
     body. Along a clip the numbers are continuous, beyond half a turn too (`clip.unwrap_vectors`); at the start of every
     clip angles are at most pi. clip None: the rest pose, all 0.
     """
-    features, count = _features(rig)
-    out = np.zeros(count)
     if clip is None:
-        return out
+        return np.zeros(_features(rig)[1])
+    return clip_features(rig, clip, np.array([seconds]))[0]
+
+
+def clip_features(rig: Rig, clip: Clip, seconds: F64) -> F64:
+    """`pose_features` (M, j) at several times (M,) of one clip."""
+    features, count = _features(rig)
+    out = np.zeros((len(seconds), count))
     for feature in features:
         channel = _channel(clip, feature.node, feature.path)
         if channel is None:
             continue
-        value = sample(channel, np.array([seconds]))
+        values = sample(channel, seconds)
         if feature.path == "rotation":
             times, lifted = _lifted(rig, channel)
-            at = max(int(np.searchsorted(times, min(seconds, times[-1]), side="right")) - 1, 0)
-            number = unwrap_vectors(_relative(rig, feature.node, value), lifted[at])[0]
+            before = np.maximum(np.searchsorted(times, np.minimum(seconds, times[-1]), side="right") - 1, 0)
+            values = nearest_turn(_relative(rig, feature.node, values), lifted[before])
         else:
-            number = value[0] - getattr(rig, feature.path)[feature.node]
+            values = values - getattr(rig, feature.path)[feature.node]
             if feature.path == "translation":
-                number = number / _extent(rig)
-        out[feature.start : feature.start + 3] = number
+                values = values / _extent(rig)
+        out[:, feature.start : feature.start + 3] = values
     return out
 
 
@@ -281,7 +287,7 @@ def _relative(rig: Rig, node: int, rotations: F64) -> F64:
 def _lifted(rig: Rig, channel: Channel) -> tuple[F64, F64]:
     """Times (M,) and continuous rotation vectors (M, 3) of a rotation channel."""
     times = _followed(channel)
-    return times, unwrap_vectors(_relative(rig, channel.node, sample(channel, times)), np.zeros(3))
+    return times, unwrap_vectors(_relative(rig, channel.node, sample(channel, times)))
 
 
 def _extent(rig: Rig) -> float:
