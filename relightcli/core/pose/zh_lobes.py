@@ -26,9 +26,10 @@ from numpy.typing import NDArray
 
 from relightcli.core.shade.gather import in_parts
 
-RIDGE = 3e-3
+RIDGE = 1e-2
 STEPS = 12  # of Gauss-Newton and their damped trials, per frame
 FIRST_STEPS = 60  # where a vertex starts
+SETTLE = 5  # fits of a clip's first frame, each drawn to the last, until the mean's lobes are forgotten
 TRIALS = 3  # seeds per lobe that are followed
 ENOUGH = 1e-5  # of the energy: a step that gains less is the last
 MOST_LOBES = 4
@@ -450,8 +451,9 @@ def _fit(values, starts, order, count, seeds, norms, first, last, axis, zonal): 
                 room.before[:] = first_z
             total = _load(values[t, v], norms, a)
             if total > 0.0:
-                _refine(a, order, s, STEPS, ENOUGH * total, z, room)
-                room.before[:] = z
+                for _ in range(SETTLE if starts[t] else 1):
+                    _refine(a, order, s, STEPS, ENOUGH * total, z, room)
+                    room.before[:] = z
             else:
                 z[:] = 0.0
             for x in range(count):
