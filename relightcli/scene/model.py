@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,6 +105,8 @@ class Geometry:
     two_sided     (O,) bool per object
     textures      per material index: (H, W, 3) float32 linear RGB, for materials that have one
     notes         what was repaired or left out while loading, for the user to read
+    rigs          of skinned objects, by name: `core.pose.rig.Rig`; its vertices are the object's, in order. The
+                  arrays above hold the object as posed, in the rest pose unless something else is said
     """
 
     object_names: tuple[str, ...]
@@ -118,3 +120,4 @@ class Geometry:
     two_sided: NDArray[np.bool_]
     textures: dict[int, NDArray[np.float32]]
     notes: tuple[str, ...] = ()
+    rigs: dict[str, Any] = field(default_factory=dict)

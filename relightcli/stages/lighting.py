@@ -23,6 +23,7 @@ from relightcli.core.transport.receivers import receivers_of_vertices
 from relightcli.errors import InputError, StoreError
 from relightcli.scene.describe import scene_from_json
 from relightcli.scene.model import Geometry, Material, Scene
+from relightcli.stages.rig_store import read_rigs
 
 if TYPE_CHECKING:
     from relightcli.core.shade.gather import Gather
@@ -86,6 +87,7 @@ def read_scene(store: formats.Store) -> tuple[Scene, Geometry]:
         read("objects/material"),
         read("objects/two_sided"),
         textures,
+        rigs=read_rigs(store),
     )
     return scene, geometry
 

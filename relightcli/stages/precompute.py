@@ -39,6 +39,7 @@ from relightcli.stages.receiver_setup import (
     unburied,
     with_vertices,
 )
+from relightcli.stages.rig_store import put_rigs
 from relightcli.stages.visibility_job import VisibilityJob, block_size, create_outputs
 
 KIND = "transfer"
@@ -143,6 +144,7 @@ def precompute(config: Config) -> dict[str, Any]:
             }
         )
         put_geometry(writer, geometry)
+        put_rigs(writer, geometry)
         if geometry is not source:
             writer.put("source/face", source.faces, dims=("face", "corner"))
         put_receivers(writer, receivers, buried)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import relight_formats as formats
+from relightcli.errors import InputError
 from relightcli.stages.lighting import LightingStore
 from relightcli.stages.outputs import Config, check, check_shots, numbered, output_suffix, resolve_environment
 from relightcli.stages.session import Session
@@ -20,7 +21,7 @@ def relight(config: Config) -> dict[str, Any]:
     started = time.perf_counter()
     suffix = output_suffix(config.output)
     check(config, suffix)
-    default = Shot(1, config.env, config.env_rotate, config.camera, config.exposure, config.settings)
+    default = Shot(1, config.env, config.env_rotate, config.camera, config.exposure, config.settings, config.poses)
     shots = [default] if config.frames is None else read_shots(config.frames, default)
     if config.reference:
         from relightcli.stages.reference import render_reference
@@ -28,6 +29,11 @@ def relight(config: Config) -> dict[str, Any]:
         return render_reference(config, shots, suffix, started)
     lighting = open_lighting(config.store, config.workers)
     check_shots(config, shots, lighting.scene)
+    if any(shot.poses for shot in shots):
+        raise InputError(
+            f"--pose: {config.store} lights its objects where they stood when it was made; add --reference, or pose "
+            "what fit-pose made of it"
+        )
     if config.previous is not None:
         lighting.resume(config.previous)
     if config.dry_run:

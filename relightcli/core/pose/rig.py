@@ -118,6 +118,11 @@ def skin(rig: Rig, matrices: F64) -> tuple[F64, F64, F64]:
     return position, normal, tangent
 
 
+def posed(rig: Rig, transform: F64, clip: Clip | None, seconds: float = 0.0) -> tuple[F64, F64, F64]:
+    """`skin` of a pose, (V, 3) each, in the space that `transform` (4, 4) takes the rig's to: an object's place."""
+    return skin(rig, transform @ joint_matrices(rig, clip, seconds))
+
+
 @njit(cache=True)
 def _skin(position, normal, tangent, joint, weight, matrices):  # type: ignore[no-untyped-def]
     count = len(position)
