@@ -71,7 +71,11 @@ class Lighting(NamedTuple):
 
 
 def lighting(kappa: NDArray[np.float64], light: NDArray[np.float64], order: int) -> Lighting:
-    """kappa (2 n - 1,) of the kernel, light (S, 3) in the world's frame, order n of visibility."""
+    """kappa (B,) of the kernel, light (S, 3) in the world's frame, order n of visibility.
+
+    B = 2 n - 1 is all that n bands of light and visibility have; more bands of light cost nothing here, and count up to
+    B + n - 1.
+    """
     table = lighting_matrix(kappa, light, order)  # (bands^2, n^2, 3)
     band = np.flatnonzero(kappa != 0.0)
     # The kernel evaluates harmonics of unit length per band.
@@ -95,9 +99,9 @@ def shade(
     (V, 3): the kernel's axis R; kernel (V,): which of `lights`, -1 for none (0 comes out).
     """
     out = np.zeros((len(frames), 3), np.float32)
-    norms = unit_norms(2 * model.order - 1)
     samples, inverse = _rotation_samples(model.order)
     bands = np.concatenate([light.band for light in lights])
+    norms = unit_norms(max(model.order, int(bands.max(initial=0)) + 1))
     start = np.cumsum([0, *(len(light.band) for light in lights)])
     table = np.concatenate([light.table for light in lights])
     first = np.cumsum([0, *(len(light.table) for light in lights)])
@@ -120,7 +124,7 @@ def incident(
     out = np.empty((len(frames), 3, model.order**2), np.float32)
     table = lighting_matrix(np.ones(model.order), light, model.order)  # (n^2, n^2, 3)
     rows = np.ascontiguousarray(np.moveaxis(table, 2, 0), np.float32)
-    norms = unit_norms(2 * model.order - 1)
+    norms = unit_norms(model.order)
     samples, inverse = _rotation_samples(model.order)
     score = np.ascontiguousarray(scores, np.float32)
 
@@ -134,7 +138,7 @@ def incident(
 def visibility(model: Synthesis, scores: NDArray[np.float64], frames: F32) -> F32:
     """Visibility (V, n^2) float32 of a pose in the world's frame."""
     out = np.empty((len(frames), model.order**2), np.float32)
-    norms = unit_norms(2 * model.order - 1)
+    norms = unit_norms(model.order)
     samples, inverse = _rotation_samples(model.order)
     _visibility(model, np.ascontiguousarray(scores, np.float32), frames, norms, samples, inverse, out)
     return out
@@ -159,7 +163,7 @@ def _rotation_samples(order: int) -> tuple[F32, F32]:
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz", "arcp"})
 def _synthesize(model, score, frame, i, norms, samples, inverse, number, u, v):  # type: ignore[no-untyped-def]
-    """v (n^2,) of vertex i in the world. number (P,), u ((2 n - 1)^2,) are room."""
+    """v (n^2,) of vertex i in the world. number (P,) and u are room."""
     order, size = model.order, model.order * model.order
     for p in range(len(number)):
         total = np.float32(0.0)
