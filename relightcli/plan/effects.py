@@ -1,7 +1,7 @@
 """Which effects a scene calls for, with the evidence.
 
 Names follow interface.md: direct, shadows, one-bounce, two-bounce, specular, fields, pose. This version does not
-simulate the last two; a scene or a user that needs one is told so. Interreflections are simulated when they are asked
+simulate fields; a scene or a user that needs them is told so. Interreflections are simulated when they are asked
 for, by name or by number. Specular lobes cost nothing here: they are integrated when a picture is made.
 """
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from relightcli.errors import InputError
 
 KNOWN = ("direct", "shadows", "one-bounce", "two-bounce", "specular", "fields", "pose")
-AVAILABLE = ("direct", "shadows", "one-bounce", "two-bounce", "specular")
+AVAILABLE = ("direct", "shadows", "one-bounce", "two-bounce", "specular", "pose")
 BOUNCES = {"one-bounce": 1, "two-bounce": 2}
 
 
@@ -65,17 +65,16 @@ def bounces_asked(asked: tuple[str, ...] | None, bounces: int | None) -> int:
 
 
 def need_static(motions: dict[str, str], asked: tuple[str, ...] | None) -> None:
-    """Raises InputError where an object moves: its effect (fields, pose) is not simulated by this version.
+    """Raises InputError where an object moves as a whole: that needs fields, which this version does not simulate.
 
     Naming the effects (`--effects direct,shadows`) simulates moving objects where the scene file puts them.
     """
     if asked is not None:
         return
     for name, motion in motions.items():
-        if motion != "static":
-            effect = "fields" if motion == "rigid" else "pose"
+        if motion == "rigid":
             raise InputError(
-                f"objects.{name}.motion is {motion!r}: this needs the effect '{effect}', which this version does not "
+                f"objects.{name}.motion is {motion!r}: this needs the effect 'fields', which this version does not "
                 'simulate; use motion = "static", or --effects direct,shadows to keep the object where it stands'
             )
 
@@ -103,6 +102,18 @@ def decide(
             plan.append(Decision(name, True, f"asked for: {bounces} interreflections"))
     evidence = "integrated from visibility when a picture is made" if lobes else "no material has a specular lobe"
     return [*plan, Decision("specular", lobes, evidence)]
+
+
+def decide_pose(asked: tuple[str, ...] | None, clips: dict[str, int]) -> Decision:
+    """Whether skinned objects are posed. clips: how many each of them has."""
+    moving = [name for name, count in clips.items() if count]
+    if not clips:
+        return Decision("pose", False, "no object is skinned")
+    if not moving:
+        return Decision("pose", False, f"no clip moves {', '.join(clips)}")
+    if asked is not None and "pose" not in asked:
+        return Decision("pose", False, "not asked for: skinned objects stand in their rest pose")
+    return Decision("pose", True, f"skinned: {', '.join(moving)}")
 
 
 def _shadows(

@@ -26,6 +26,7 @@ from relightcli.scene.build import build_geometry, scene_to_json
 from relightcli.scene.model import Geometry, Scene
 from relightcli.scene.parse import load_scene
 from relightcli.stages.inputs import scene_inputs
+from relightcli.stages.pose_job import check_pose_options, choose_frames, simulate_poses
 from relightcli.stages.receiver_setup import (
     MOST_PIXEL_GRID,
     PixelReceivers,
@@ -68,6 +69,10 @@ class Config:
     sh_order: int = 6
     bounces: int | None = None
     bounce_resolution: int | None = None
+    pose_frames: str = "spread:200"
+    pose_order: int = 4
+    pose_directions: int = 1024
+    pose_surroundings: bool = False
     seed: int = 0
     workers: int = 1
     overwrite: bool = False
@@ -94,6 +99,7 @@ def precompute(config: Config) -> dict[str, Any]:
     if bounces:
         _check_bounces(config)
     plan = effects.decide(asked, geometry.positions, geometry.faces, bool(both.any()), _lobes(scene), bounces)
+    plan.append(effects.decide_pose(asked, {name: len(rig.clips) for name, rig in geometry.rigs.items()}))
     simulated = [d.effect for d in plan if d.simulate]
     shadows = "shadows" in simulated
     bounce_cells = 0
@@ -120,6 +126,13 @@ def precompute(config: Config) -> dict[str, Any]:
         settings["bounce_resolution"] = bounce_cells
     if config.basis == "haar":
         settings |= {"coefficients": config.coefficients, "tolerance": config.tolerance}
+    if "pose" in simulated:
+        settings |= {
+            "pose_frames": config.pose_frames,
+            "pose_order": config.pose_order,
+            "pose_directions": config.pose_directions,
+            "pose_surroundings": config.pose_surroundings,
+        }
     if config.basis == "sh":
         settings["sh_order"] = config.sh_order
     writer = formats.begin(
@@ -134,7 +147,7 @@ def precompute(config: Config) -> dict[str, Any]:
         return {"store": str(config.output), "status": "up to date", "notes": list(geometry.notes)}
     with writer:
         resumed = bool(writer.done)
-        receivers, buried = _receivers(config, scene, source, geometry, both, shadows, bool(bounce_cells))
+        receivers, buried = _receivers(config, scene, source, geometry, both, plan, bool(bounce_cells))
         points = receivers.points if isinstance(receivers, PixelReceivers) else receivers
         writer.set_attrs(
             {
@@ -163,6 +176,7 @@ def precompute(config: Config) -> dict[str, Any]:
             tuple(scene.lights.values()),
             bounce_cells,
             int(np.count_nonzero(points.vertex < 0)),
+            _posed(geometry, plan),
         )
         create_outputs(writer, job, len(receivers))
         run.run_blocks(
@@ -174,6 +188,18 @@ def precompute(config: Config) -> dict[str, Any]:
             quiet=config.quiet,
         )
         run.close_worker()
+        if "pose" in simulated:
+            simulate_poses(
+                writer,
+                scene,
+                geometry,
+                config.pose_frames,
+                config.pose_order,
+                config.pose_directions,
+                config.pose_surroundings,
+                config.workers,
+                config.quiet,
+            )
         writer.commit({"seconds": time.perf_counter() - started, "resumed": resumed, "workers": config.workers})
     return _summary(config, started, resumed, geometry)
 
@@ -200,6 +226,7 @@ def _check(config: Config) -> None:
         raise InputError(f"--pixel-grid: expected 1 to {MOST_PIXEL_GRID}; found {config.pixel_grid}")
     if config.pixel_grid != 1 and config.receivers == "vertices":
         raise InputError("--pixel-grid: needs --receivers pixels:CAMERA")
+    check_pose_options(config.pose_frames, config.pose_order, config.pose_directions)
     if config.bounces is not None and not 0 <= config.bounces <= MOST_BOUNCES:
         raise InputError(f"--bounces: expected 0 to {MOST_BOUNCES}; found {config.bounces}")
 
@@ -228,7 +255,7 @@ def _receivers(
     source: Geometry,
     geometry: Geometry,
     both: NDArray[np.bool_],
-    shadows: bool,
+    plan: list[effects.Decision],
     bounces: bool,
 ) -> tuple[Receivers | PixelReceivers, NDArray[np.bool_] | None]:
     """The receivers, and which of them are buried, (N,), where there are any on vertices.
@@ -241,11 +268,19 @@ def _receivers(
         return asked, None
     vertices = on_vertices(geometry, both) if isinstance(asked, PixelReceivers) else asked
     buried = np.zeros(len(vertices), bool)
+    shadows = any(d.effect == "shadows" and d.simulate for d in plan)
     if shadows and not config.dry_run:
-        vertices, buried = unburied(geometry, vertices)
+        vertices, buried = unburied(geometry, vertices, _posed(geometry, plan))
     if isinstance(asked, PixelReceivers):
         return with_vertices(asked, vertices), np.concatenate([np.zeros(len(asked), bool), buried])
     return vertices, buried
+
+
+def _posed(geometry: Geometry, plan: list[effects.Decision]) -> tuple[int, ...]:
+    """Objects that will stand otherwise when pictures are made: they block nothing for the receivers of others."""
+    if not any(d.effect == "pose" and d.simulate for d in plan):
+        return ()
+    return tuple(geometry.object_names.index(name) for name, rig in geometry.rigs.items() if rig.clips)
 
 
 def _both_sides(scene: Scene, geometry: Geometry) -> NDArray[np.bool_]:
@@ -311,7 +346,7 @@ def _dry_run(
 
     The bytes are an upper bound: the mesh counts uncompressed, and the pilot's bits compress worse in small groups.
     """
-    receivers, _ = _receivers(config, scene, source, geometry, both, shadows, bool(bounce_cells))
+    receivers, _ = _receivers(config, scene, source, geometry, both, plan, bool(bounce_cells))
     points = receivers.points if isinstance(receivers, PixelReceivers) else receivers
     rays = seconds = packed = 0.0
     if shadows and len(points):
@@ -339,7 +374,19 @@ def _dry_run(
                     packed += len(zlib.compress(hits.tobytes(), 1))
         rays *= len(points) / pilot
         packed *= len(points) / pilot
-        seconds *= len(points) / pilot / max(1, config.workers)
+        seconds *= len(points) / pilot
+    if any(d.effect == "pose" and d.simulate for d in plan):
+        coefficients = config.pose_order**2
+        samples = sum(
+            len(choose_frames(rig, config.pose_frames)) * len(rig.position)
+            for rig in geometry.rigs.values()
+            if rig.clips
+        )
+        if rays:
+            seconds *= 1.0 + samples * config.pose_directions / rays
+        rays += samples * config.pose_directions
+        packed += 4 * samples * coefficients
+    seconds /= max(1, config.workers)
     return {
         "dry_run": True,
         "store": str(config.output),

@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 
 from relightcli.errors import InputError
-from relightcli.plan.effects import AVAILABLE, blocks_nothing, bounces_asked, decide, need_static, parse_effects
+from relightcli.plan.effects import (
+    AVAILABLE,
+    blocks_nothing,
+    bounces_asked,
+    decide,
+    decide_pose,
+    need_static,
+    parse_effects,
+)
 from tests.core.transport.scenes import sphere_grid
 
 BALL, BALL_FACES = (x[0].astype(x[1]) for x in zip(sphere_grid(12, 24), (np.float64, np.int32), strict=True))
@@ -35,12 +43,29 @@ def test_names_that_are_refused(text, message):
         parse_effects(text)
 
 
-def test_moving_objects_need_effects_that_are_not_there():
+def test_moving_objects_need_an_effect_that_is_not_there():
     need_static({"a": "static"}, None)
     need_static({"a": "rigid"}, ("direct", "shadows"))
-    for motion, effect in (("rigid", "fields"), ("skinned", "pose")):
-        with pytest.raises(InputError, match=f"objects.b.motion is '{motion}'.*'{effect}'"):
-            need_static({"a": "static", "b": motion}, None)
+    need_static({"a": "skinned"}, None)
+    with pytest.raises(InputError, match=r"objects\.b\.motion is 'rigid'.*'fields'"):
+        need_static({"a": "static", "b": "rigid"}, None)
+
+
+@pytest.mark.parametrize(
+    ("asked", "clips", "simulate", "evidence"),
+    [
+        (None, {}, False, "no object is skinned"),
+        (("direct", "pose"), {}, False, "no object is skinned"),
+        (None, {"man": 0}, False, "no clip moves man"),
+        (None, {"man": 0, "fox": 3}, True, "skinned: fox"),
+        (AVAILABLE, {"man": 1}, True, "skinned: man"),
+        (("direct", "shadows"), {"man": 1}, False, "not asked for"),
+    ],
+)
+def test_poses_of_what_has_clips(asked, clips, simulate, evidence):
+    decision = decide_pose(asked, clips)
+    assert decision.simulate == simulate
+    assert decision.evidence.startswith(evidence)
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e6])

@@ -112,7 +112,7 @@ def skin(rig: Rig, matrices: F64) -> tuple[F64, F64, F64]:
     transpose of the blended matrix, so they stay right under scales that differ by axis; tangents by the matrix itself,
     made orthogonal to the normal again. Where the blend is singular and leaves no direction, the frame is any one.
     """
-    position, normal, tangent = _skin(
+    position, normal, tangent = blend(
         rig.position, rig.normal, rig.tangent, rig.joint, rig.weight, np.ascontiguousarray(matrices)
     )
     return position, normal, tangent
@@ -124,7 +124,8 @@ def posed(rig: Rig, transform: F64, clip: Clip | None, seconds: float = 0.0) -> 
 
 
 @njit(cache=True)
-def _skin(position, normal, tangent, joint, weight, matrices):  # type: ignore[no-untyped-def]
+def blend(position, normal, tangent, joint, weight, matrices):  # type: ignore[no-untyped-def]
+    """`skin` of a rig's arrays of those names."""
     count = len(position)
     out_p, out_n, out_t = np.empty((count, 3)), np.empty((count, 3)), np.empty((count, 3))
     m = np.empty((3, 4))
