@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 IN_MEMORY = 1 << 30  # visibility up to this size stays in memory between frames
 ENTRIES = 1 << 23  # of pixels' gathers that are made at a time
-KINDS = ("transfer", "clusters", "asset", "light_clusters")
+KINDS = ("transfer", "clusters", "asset", "light_clusters", "pose")
 BLACK = (0.0, 0.0, 0.0)
 
 
@@ -143,6 +143,15 @@ class LightingStore:
         raise InputError(
             f"--from {previous}: needs a store of clustered lights, which cluster --light-resolution makes"
         )
+
+    def set_poses(self, poses: tuple[str, ...]) -> list[str]:
+        """Poses skinned objects; notes about it. Raises InputError where a store cannot."""
+        if poses:
+            raise InputError(
+                f"--pose: {self.store.path} lights its objects where they stood when it was made; add --reference, or "
+                "pose what fit-pose made of it"
+            )
+        return []
 
     def put_light(self, writer: formats.Writer) -> None:
         """Writes what a later `resume` needs, if anything."""

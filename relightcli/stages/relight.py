@@ -7,9 +7,16 @@ from pathlib import Path
 from typing import Any
 
 import relight_formats as formats
-from relightcli.errors import InputError
 from relightcli.stages.lighting import LightingStore
-from relightcli.stages.outputs import Config, check, check_shots, numbered, output_suffix, resolve_environment
+from relightcli.stages.outputs import (
+    Config,
+    check,
+    check_poses,
+    check_shots,
+    numbered,
+    output_suffix,
+    resolve_environment,
+)
 from relightcli.stages.session import Session
 from relightcli.stages.shots import Shot, read_shots
 
@@ -29,11 +36,12 @@ def relight(config: Config) -> dict[str, Any]:
         return render_reference(config, shots, suffix, started)
     lighting = open_lighting(config.store, config.workers)
     check_shots(config, shots, lighting.scene)
-    if any(shot.poses for shot in shots):
-        raise InputError(
-            f"--pose: {config.store} lights its objects where they stood when it was made; add --reference, or pose "
-            "what fit-pose made of it"
-        )
+    for shot in shots:
+        if shot.poses:  # whether the store poses at all, before anything is written
+            check_poses(config, shots, lighting.scene, lighting.geometry)
+            lighting.set_poses(shot.poses)
+            lighting.set_poses(())
+            break
     if config.previous is not None:
         lighting.resume(config.previous)
     if config.dry_run:
@@ -71,6 +79,10 @@ def open_lighting(path: Path, threads: int) -> LightingStore:
         from relightcli.stages.clustered import ClusteredStore
 
         return ClusteredStore(store, threads)
+    if store.kind == "pose":
+        from relightcli.stages.posed import PoseStore
+
+        return PoseStore(store, threads)
     return LightingStore(store, threads)
 
 
