@@ -11,7 +11,9 @@ All are y = intercept + slope . scores, with a row of numbers y per vertex; they
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -19,12 +21,13 @@ from numpy.typing import NDArray
 
 from relightcli.core.pose.linear_model import (
     COMPONENTS,
+    PoseSpace,
     gap,
     pose_space,
     regress,
     segments,
 )
-from relightcli.core.pose.lobe_parameters import LOG, lobes_of, parameters_of
+from relightcli.core.pose.lobe_parameters import LOG, Parameters, lobes_of, parameters_of
 from relightcli.core.pose.phong_operator import phong_matrix
 from relightcli.core.pose.zh_lobes import Lobes, fit_lobes, visibility_of
 
@@ -134,9 +137,9 @@ def fit_model(
     held_out = None
     if part.max() > 0:
         sample = training.at(_spread(visibility.shape[1], SOME))
-        held_out = _errors(sample.truth, sample.held_out(part, ridge), settings.weight)
+        held_out = _errors(sample.truth, sample.held_out(part, [ridge])[0], settings.weight)
     lobes = None if training.lobes is None else relative(visibility_of(training.lobes), truth)
-    space = pose_space(features, settings.components)
+    space = training.space
     report = Report(
         errors,
         held_out,
@@ -178,18 +181,27 @@ class _Training:
         kept = ~frames
         return _Training(self.features[kept], self.truth[kept], self.clip[kept], self.settings, self.threads, lobes)
 
+    @cached_property
+    def space(self) -> PoseSpace:
+        return pose_space(self.features, self.settings.components)
+
+    @cached_property
+    def parameters(self) -> Parameters:
+        assert self.lobes is not None
+        return parameters_of(self.lobes, self.settings.axes)
+
     def fit(self, ridge: float) -> PoseModel:
         order = math.isqrt(self.truth.shape[2])
         if self.settings.kind == "reduced":
             return self._reduced(ridge, order)
-        space = pose_space(self.features, self.settings.components)
+        space = self.space
         scores = space.scores(self.features)
         if self.lobes is None:
             found = regress(scores, space.share, self.truth, ridge, threads=self.threads)
             centre = np.zeros((self.truth.shape[1], 0, 3))
         else:
             count, bands = self.lobes.zonal.shape[2:]
-            values = parameters_of(self.lobes, self.settings.axes)
+            values = self.parameters
             weight_of = np.full(values.value.shape[2], -1, np.int64)
             if self.settings.axes == LOG:  # an axis means as much as its lobe has energy
                 weight_of[1 + count * bands :] = np.repeat(np.arange(count), 2)
@@ -214,16 +226,19 @@ class _Training:
         intercept = mean + np.einsum("k,vsk->vs", found.intercept[0], slope)
         return PoseModel(space.mean, directions, intercept, slope, np.zeros((vertices, 0, 3)), order)
 
-    def held_out(self, part: NDArray[np.int64], ridge: float) -> NDArray[np.float32]:
-        """Visibility at every frame as a model predicts it that has not seen the frame's segment."""
-        out = np.empty_like(self.truth)
+    def held_out(self, part: NDArray[np.int64], ridges: Sequence[float]) -> list[NDArray[np.float32]]:
+        """Per ridge, visibility at every frame as a model predicts it that has not seen the frame's segment."""
+        out = [np.empty_like(self.truth) for _ in ridges]
         for k in range(int(part.max()) + 1):
-            out[part == k] = predict(self.without(part == k).fit(ridge), self.features[part == k], self.settings.axes)
+            own = part == k
+            rest = self.without(own)
+            for found, ridge in zip(out, ridges, strict=True):
+                found[own] = predict(rest.fit(ridge), self.features[own], self.settings.axes)
         return out
 
     def best_ridge(self, part: NDArray[np.int64]) -> float:
         """The ridge whose predictions of held-out frames err least; of equals the smallest."""
-        errors = [relative(self.held_out(part, ridge), self.truth) for ridge in RIDGES]
+        errors = [relative(found, self.truth) for found in self.held_out(part, RIDGES)]
         return RIDGES[int(np.argmin(errors))]
 
 
