@@ -10,8 +10,8 @@ from relightcli.core.pose.visibility import hemisphere_directions, hemisphere_ha
 from relightcli.core.sphere.sh import harmonics
 
 ORDER = 4
-# The lattice's discrepancy: measured on caps and wedges, 1.1 % of the coefficients' norm at 1024 directions and less.
-LATTICE = 0.015
+# The lattice's discrepancy with 1024 directions: 0.25 to 0.53 % of the coefficients' norm, measured on these shapes.
+LATTICE = 0.008
 
 
 def zonal(height, order):
@@ -118,4 +118,4 @@ def test_more_directions_come_closer():
     corners, faces = ball(np.array([1.0, 0.5, 1.5]), 0.8)
     truth = one(corners, faces, count=60_000)
     errors = [np.linalg.norm(one(corners, faces, count=n) - truth) for n in (64, 512, 4096)]
-    assert errors[0] > 2 * errors[1] > 4 * errors[2]  # 1 / n^(3/4): a factor of 4.8 each
+    assert errors[0] > 2 * errors[1] > 4 * errors[2]  # measured: 0.068, 0.020, 0.0045
