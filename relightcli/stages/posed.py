@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 import relight_formats as formats
 from relightcli.core.brdf.models import PHONG, SHININESS, SPECULAR
+from relightcli.core.brdf.separable import POLAR
 from relightcli.core.lights.environment import SkyCube
 from relightcli.core.pose.clip import Clip
 from relightcli.core.pose.linear_model import distance
@@ -272,7 +273,7 @@ class PoseStore(LightingStore):
             arriving = incident(item.model, state.scores, state.frames, _light(sky, order, order), self.threads)
             turned = local_rotations(normal[rows].astype(np.float32), order)
             local = np.ascontiguousarray(np.einsum("nst,nct->ncs", turned, arriving[rows]))
-            table = np.zeros((len(coats.table.model), *response(0, coats.table.parameters[0], order).shape), np.float32)
+            table = np.zeros((len(coats.table.model), POLAR, order * (order + 1) // 2), np.float32)
             for m in others:
                 table[m] = response(int(coats.table.model[m]), coats.table.parameters[m], order)
             both = shade_low_order(
