@@ -22,7 +22,7 @@ from relightcli.adapters.gltf import (
     read_primitive,
     walk,
 )
-from relightcli.core.pose.clip import Channel, Clip, Interpolation, PathName
+from relightcli.core.pose.clip import Channel, Clip, Interpolation, PathName, quaternion_of
 
 F64 = NDArray[np.float64]
 _WIDTH = {"translation": 3, "rotation": 4, "scale": 3}
@@ -104,10 +104,21 @@ def _nodes(file: GltfFile, found: SkinnedFile) -> dict[int, int]:
         found.node_names.append(_unused(str(node.get("name") or f"node{index}"), found.node_names))
         found.parent.append(place[parent] if parent >= 0 else -1)
         found.rest.append(local_matrix(file, node, index))
+        properties = _decomposed(found.rest[-1]) if "matrix" in node else {}
         for path, values in found.properties.items():
-            value = np.array(node.get(path, _REST[path]), np.float64)
+            value = np.array(properties.get(path, node.get(path, _REST[path])), np.float64)
             values.append(value / np.linalg.norm(value) if path == "rotation" and value.any() else value)
     return place
+
+
+def _decomposed(matrix: F64) -> dict[str, Any]:
+    """Translation, rotation and scale of a node's matrix (4, 4), exact but for shears. Captured motion moves them."""
+    scale = np.linalg.norm(matrix[:3, :3], axis=0)
+    scale[2] *= np.sign(np.linalg.det(matrix[:3, :3])) or 1.0
+    if not scale.all():
+        return {"translation": matrix[:3, 3], "scale": scale}
+    rotation = quaternion_of(matrix[:3, :3] / scale)
+    return {"translation": matrix[:3, 3], "rotation": rotation, "scale": scale}
 
 
 def _unused(name: str, names: list[str]) -> str:

@@ -34,6 +34,7 @@ def build_geometry(scene: Scene) -> Geometry:
     from relightcli.adapters.meshes import MAX_COORDINATE, load_mesh
     from relightcli.adapters.rigs import load_rig
     from relightcli.core.pose.rig import posed
+    from relightcli.scene.motions import add_motions
 
     material_index = {name: index for index, name in enumerate(scene.materials)}
     meshes: dict[Path, LoadedMesh] = {}
@@ -48,7 +49,8 @@ def build_geometry(scene: Scene) -> Geometry:
         if spec.motion == "skinned":
             if spec.mesh not in loaded_rigs:
                 loaded_rigs[spec.mesh] = load_rig(spec.mesh)
-            mesh, rigs[spec.name] = loaded_rigs[spec.mesh]
+            mesh, rig = loaded_rigs[spec.mesh]
+            rigs[spec.name] = add_motions(rig, spec)
         else:
             if spec.mesh not in meshes:
                 meshes[spec.mesh] = load_mesh(spec.mesh)

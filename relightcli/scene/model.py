@@ -43,6 +43,8 @@ class ObjectSpec:
     transform: NDArray[np.float64]  # (4, 4), row-major, acts on column vectors
     two_sided: bool = False
     motion: MotionName = "static"
+    motion_files: tuple[Path, ...] = ()  # skinned: BVH files, each a clip of its name
+    joint_map: Path | None = None  # which of their joints moves which node
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
@@ -157,13 +158,21 @@ def nearest_turn(vectors: F64, references: F64) -> F64:
     return np.asarray(vectors + 2.0 * np.pi * turns * axis)
 
 
-def unwrap_vectors(vectors: F64) -> F64:
+@njit(cache=True)
+def unwrap_vectors(vectors):  # type: ignore[no-untyped-def]
     """Rotation vectors (M, 3) of a motion, each moved by whole turns to be nearest to the one before.
 
     The result is continuous in time where the motion is, unless it leaves a full turn away from rest about another
     axis than it came there by: no rotation vectors are, there.
     """
     out = vectors.copy()
+    axis = np.empty(3)
     for i in range(1, len(out)):
-        out[i] = nearest_turn(vectors[i : i + 1], out[i - 1 : i])[0]
+        size = np.sqrt((vectors[i] * vectors[i]).sum())
+        axis[:] = vectors[i] if size > 1e-12 else out[i - 1]
+        size = np.sqrt((axis * axis).sum())
+        if size > 1e-12:
+            axis /= size
+            turns = np.rint(((out[i - 1] - vectors[i]) * axis).sum() / (2.0 * np.pi))
+            out[i] += 2.0 * np.pi * turns * axis
     return out
