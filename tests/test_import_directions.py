@@ -11,8 +11,8 @@ import relightcli
 
 PACKAGE = Path(relightcli.__file__).parent
 
-# What each room may import of the project. `core` and `plan` know the plain records of `scene.model` and nothing else of
-# `scene`; `errors` is the only module that all may import, and the only one below `stages` that knows the store format.
+# What each room may import of the project. `core` and `plan` know the plain records of `scene.model` and nothing else
+# of `scene`; `errors` is the only module that all may import, and the only one below `stages` that knows the store format.
 ALLOWED = {
     "cli": {"cli", "stages", "errors", "__version__"},
     "stages": {"stages", "plan", "run", "scene", "adapters", "core", "errors", "relight_formats", "__version__"},
@@ -61,7 +61,7 @@ def room_of(path):
 
 
 def target(module, room):
-    """Room (or scene.model, seen from core and plan) that a module of the project belongs to, or None for other libraries."""
+    """Room (scene.model as seen from core and plan) that a module of the project is in; None for other libraries."""
     parts = module.split(".")
     if parts[0] == "relight_formats":
         return "relight_formats"

@@ -2,7 +2,8 @@
 
 Read here and not through trimesh, which drops the texture coordinates of primitives without a material, takes
 normalised integers at face value, and fills sparse and compressed accessors with zeros. What is left out (skins,
-morph targets, lines and points) is named in the notes. Source: Khronos glTF 2.0 specification, sections in brackets.
+which `gltf_skin` reads, morph targets, lines and points) is named in the notes. Source: Khronos glTF 2.0
+specification, sections in brackets.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "
 # An accessor without a buffer view is all zeros and costs no bytes in the file, so its count needs a limit of its own.
 _MAX_COUNT = 1 << 27
 # Instancing multiplies what a small file can ask for.
-_MAX_CORNERS = 3 * (1 << 27)
+MAX_CORNERS = 3 * (1 << 27)
 # Extensions that a file may require without changing its triangles.
 _HARMLESS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "KHR_mesh_quantization", "EXT_texture_", "MSFT_texture_")
 
@@ -45,7 +46,7 @@ class Part:
 
 
 @dataclass
-class _File:
+class GltfFile:
     path: Path
     header: dict[str, Any]
     binary: bytes | None
@@ -65,32 +66,39 @@ class _File:
         return entry
 
 
-def read_gltf(path: Path, data: bytes) -> tuple[list[Part], tuple[str, ...]]:
-    """The triangle primitives of the default scene, each under its node's transform, in depth-first order, and notes.
+def open_gltf(path: Path, data: bytes) -> GltfFile:
+    """The file's header and binary chunk. Raises InputError for other versions, and extensions it cannot do without.
 
     path names the file, whose folder holds the buffers it refers to (they may not lie outside); data is its content.
-    Raises InputError for anything that does not follow the specification.
     """
     header, binary = _split(path, data)
-    file = _File(path, header, binary)
+    file = GltfFile(path, header, binary)
     if str(header.get("asset", {}).get("version", "")).split(".")[0] != "2":
         raise file.fail("expected glTF version 2 (asset.version); export it again as glTF 2.0.")
     foreign = [name for name in header.get("extensionsRequired", []) if not str(name).startswith(_HARMLESS)]
     if foreign:
         raise file.fail(f"requires {', '.join(map(str, foreign))}, which is not supported; export it without.")
+    return file
 
+
+def read_gltf(path: Path, data: bytes) -> tuple[list[Part], tuple[str, ...]]:
+    """The triangle primitives of the default scene, each under its node's transform, in depth-first order, and notes.
+
+    Arguments as `open_gltf`. Raises InputError for anything that does not follow the specification.
+    """
+    file = open_gltf(path, data)
     parts: list[Part] = []
     corners = 0
-    for node, matrix in _walk(file):
+    for node, matrix in _mesh_nodes(file):
         if "skin" in node:
             file.notes["its skin is not applied: the mesh stands in its bind pose"] = None
         for primitive in file.item("meshes", node["mesh"]).get("primitives", []):
-            part = _primitive(file, primitive)
+            part = read_primitive(file, primitive)
             if part is None:
                 continue
             corners += part.faces.size
-            if corners > _MAX_CORNERS:
-                raise file.fail(f"holds more than {_MAX_CORNERS // 3:,} triangles after instancing.")
+            if corners > MAX_CORNERS:
+                raise file.fail(f"holds more than {MAX_CORNERS // 3:,} triangles after instancing.")
             normals = np.zeros_like(part.positions) if part.normals is None else part.normals
             positions, normals, faces = transform_mesh(matrix, part.positions, normals, part.faces)
             parts.append(Part(positions, faces, None if part.normals is None else normals, part.uvs))
@@ -134,8 +142,22 @@ def _split(path: Path, data: bytes) -> tuple[dict[str, Any], bytes | None]:
     return header, binary
 
 
-def _walk(file: _File) -> list[tuple[dict[str, Any], NDArray[np.float64]]]:
+def _mesh_nodes(file: GltfFile) -> list[tuple[dict[str, Any], NDArray[np.float64]]]:
     """Nodes with a mesh, depth first, each with its world matrix [3.5]."""
+    found = []
+    world: dict[int, NDArray[np.float64]] = {-1: np.eye(4)}
+    for index, parent in walk(file):
+        node = file.item("nodes", index)
+        world[index] = world[parent] @ local_matrix(file, node, index)
+        if not np.isfinite(world[index]).all():
+            raise file.fail(f"nodes[{index}]: its transform is not finite.")
+        if "mesh" in node:
+            found.append((node, world[index]))
+    return found
+
+
+def walk(file: GltfFile) -> list[tuple[int, int]]:
+    """The nodes of the default scene, depth first: (index, its parent's index or -1) [3.5]."""
     nodes = file.header.get("nodes", [])
     if file.header.get("scenes"):
         roots = file.item("scenes", file.header.get("scene", 0)).get("nodes", [])
@@ -143,23 +165,21 @@ def _walk(file: _File) -> list[tuple[dict[str, Any], NDArray[np.float64]]]:
         children = {child for node in nodes for child in node.get("children", [])}
         roots = [i for i in range(len(nodes)) if i not in children]
     found, seen = [], set()
-    stack = [(index, np.eye(4)) for index in reversed(roots)]
+    stack = [(index, -1) for index in reversed(roots)]
     while stack:
         index, parent = stack.pop()
         node = file.item("nodes", index)
         if index in seen:
             raise file.fail(f"nodes[{index}] is reached twice; the nodes must form a tree.")
         seen.add(index)
-        world = parent @ _local(file, node, index)
-        if not np.isfinite(world).all():
-            raise file.fail(f"nodes[{index}]: its transform is not finite.")
-        if "mesh" in node:
-            found.append((node, world))
-        stack.extend((child, world) for child in reversed(node.get("children", [])))
+        found.append((index, parent))
+        stack.extend((child, index) for child in reversed(node.get("children", [])))
     return found
 
 
-def _local(file: _File, node: dict[str, Any], index: int) -> NDArray[np.float64]:
+def local_matrix(file: GltfFile, node: dict[str, Any], index: int) -> NDArray[np.float64]:
+    """A node's matrix (4, 4) relative to its parent [3.5.3]."""
+
     def vector(key: str, default: list[float]) -> NDArray[np.float64]:
         value = np.asarray(node.get(key, default), dtype=np.float64)
         if value.shape != (len(default),) or not np.isfinite(value).all():
@@ -185,7 +205,7 @@ def _local(file: _File, node: dict[str, Any], index: int) -> NDArray[np.float64]
     return matrix
 
 
-def _primitive(file: _File, primitive: dict[str, Any]) -> Part | None:
+def read_primitive(file: GltfFile, primitive: dict[str, Any]) -> Part | None:
     """One primitive in its mesh's own space, or None for lines and points [3.7.2]."""
     mode = primitive.get("mode", 4)
     if mode in (0, 1, 2, 3):
@@ -202,7 +222,7 @@ def _primitive(file: _File, primitive: dict[str, Any]) -> Part | None:
     compressed = "KHR_draco_mesh_compression" in primitive.get("extensions", {})
 
     def attribute(name: str, width: int) -> NDArray[np.float64]:
-        values = _accessor(file, attributes[name], compressed)
+        values = read_accessor(file, attributes[name], compressed)
         if values.shape[1] != width:
             raise file.fail(f"{name}: expected {width} components, found {values.shape[1]}.")
         if name != "POSITION" and len(values) != len(positions):
@@ -213,7 +233,7 @@ def _primitive(file: _File, primitive: dict[str, Any]) -> Part | None:
     positions = attribute("POSITION", 3)
     count = len(positions)
     if "indices" in primitive:
-        listed = _accessor(file, primitive["indices"], compressed)
+        listed = read_accessor(file, primitive["indices"], compressed)
         if listed.shape[1] != 1 or listed.dtype.kind != "u":
             raise file.fail(f"indices: expected unsigned whole numbers, found {listed.shape[1]} x {listed.dtype}.")
         index = listed[:, 0].astype(np.int64)
@@ -237,7 +257,7 @@ def _primitive(file: _File, primitive: dict[str, Any]) -> Part | None:
     return Part(positions, faces.astype(np.int32), normals, uvs)
 
 
-def _accessor(file: _File, index: Any, compressed: bool) -> NDArray[Any]:
+def read_accessor(file: GltfFile, index: Any, compressed: bool) -> NDArray[Any]:
     """Values (N, width) of an accessor; normalised integers become float64 [3.6.2]."""
     entry = file.item("accessors", index)
     label = f"accessors[{index}]"
@@ -266,7 +286,7 @@ def _accessor(file: _File, index: Any, compressed: bool) -> NDArray[Any]:
     return values
 
 
-def _element(file: _File, label: str, entry: dict[str, Any]) -> tuple[np.dtype[Any], int]:
+def _element(file: GltfFile, label: str, entry: dict[str, Any]) -> tuple[np.dtype[Any], int]:
     component, kind = entry.get("componentType"), entry.get("type")
     if component not in _COMPONENTS or kind not in _WIDTHS:
         raise file.fail(f"{label}: unknown componentType {component!r} or type {kind!r}.")
@@ -274,7 +294,7 @@ def _element(file: _File, label: str, entry: dict[str, Any]) -> tuple[np.dtype[A
 
 
 def _view(
-    file: _File, label: str, view_index: Any, offset: int, count: int, width: int, dtype: np.dtype[Any]
+    file: GltfFile, label: str, view_index: Any, offset: int, count: int, width: int, dtype: np.dtype[Any]
 ) -> NDArray[Any]:
     """(count, width) values inside a buffer view, checked against its bounds before anything is allocated."""
     view = file.item("bufferViews", view_index)
@@ -293,7 +313,7 @@ def _view(
     return np.ndarray((count, width), dtype, buffer, start + offset, (stride, dtype.itemsize))
 
 
-def _buffer(file: _File, index: Any) -> bytes:
+def _buffer(file: GltfFile, index: Any) -> bytes:
     """The bytes of a buffer: the GLB's own, base64 text, or a file in the same folder or below [3.6.1]."""
     if index in file.buffers:
         return file.buffers[index]

@@ -73,11 +73,11 @@ def load_mesh(path: Path) -> LoadedMesh:
     A `.bz2` around one mesh file is unpacked.
     Raises InputError, naming the file, for whatever cannot be loaded as triangles with finite coordinates.
     """
-    data, suffix = _read(path)
+    data, suffix = read_file(path)
     _import_trimesh()
     notes: list[str] = []
     try:
-        # Infinities that arise here are found and refused by `_finish`.
+        # Infinities that arise here are found and refused by `finish_mesh`.
         with np.errstate(over="ignore", invalid="ignore"):
             if suffix in (".gltf", ".glb"):
                 parts, found = read_gltf(path, data)
@@ -92,12 +92,12 @@ def load_mesh(path: Path) -> LoadedMesh:
         reason = str(error).strip().split("\n")[0][:200] or type(error).__name__
         raise InputError(f"{path}: cannot be read as a {suffix[1:].upper()} mesh ({reason}).") from error
     try:
-        return _finish(parts, notes)
+        return finish_mesh(parts, notes)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
 
-def _finish(parts: list[Part], notes: list[str]) -> LoadedMesh:
+def finish_mesh(parts: list[Part], notes: list[str]) -> LoadedMesh:
     """Join the parts, check them, and give every vertex a normal."""
     parts = [part for part in parts if len(part.faces)]
     if not parts:
@@ -139,7 +139,7 @@ def _finish(parts: list[Part], notes: list[str]) -> LoadedMesh:
     return LoadedMesh(positions, normals, uvs.astype(np.float64, copy=False), faces, tuple(notes))
 
 
-def _read(path: Path) -> tuple[bytes, str]:
+def read_file(path: Path) -> tuple[bytes, str]:
     """The file's bytes and its lower-case suffix, unpacked if it is a `.bz2`."""
     suffix = path.suffix.lower()
     packed = suffix == ".bz2"

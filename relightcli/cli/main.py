@@ -22,6 +22,7 @@ COMMANDS = {
     "precompute": "Simulate the light transport of a scene once: SCENE.toml to a transfer store.",
     "cluster": "Group receivers and find a basis for their light: a transfer store to a clusters store.",
     "factorize": "Compress the transfer tensors of a clusters store into a self-contained asset.",
+    "fit-pose": "Learn from a transfer store what skinned objects see in any pose.",
     "relight": "Make pictures from a store: new sky, camera, materials, sequences.",
     "diff": "Compare images, sequences or stores; exit 1 when they differ too much.",
     "inspect": "Show what a store holds, what it cost, and whether it is sound.",
@@ -37,7 +38,7 @@ class LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
         if name not in COMMANDS:
             return None
-        command: click.Command = import_module(f"relightcli.cli.{name}").command
+        command: click.Command = import_module(f"relightcli.cli.{name.replace('-', '_')}").command
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:

@@ -17,7 +17,7 @@ from relightcli.cli import options
     "--effects",
     default="auto",
     show_default=True,
-    help="auto, all, or names: direct,shadows,one-bounce,two-bounce,specular.",
+    help="auto, all, or names: direct,shadows,one-bounce,two-bounce,specular,pose.",
 )
 @click.option(
     "--light-resolution",
@@ -60,6 +60,19 @@ from relightcli.cli import options
     default=None,
     type=int,
     help="Cells along a cube face through which light bounces: 8, 16 (default) or 32.",
+)
+@click.option(
+    "--pose-frames",
+    default="spread:200",
+    show_default=True,
+    help="Frames that poses of skinned objects are learnt from: all, every:N of each clip, or spread:N far apart.",
+)
+@click.option("--pose-order", default=4, show_default=True, help="Bands of what posed vertices see: 1 to 8.")
+@click.option("--pose-directions", default=1024, show_default=True, help="Rays of a posed vertex in each frame.")
+@click.option(
+    "--pose-surroundings/--no-pose-surroundings",
+    default=False,
+    help="Let other objects block posed vertices, where the clips take them. Default: their own body alone.",
 )
 @click.option("--seed", default=0, type=options.SEED, show_default=True, help="Seed of the random checks.")
 @click.option("--allow-outside", is_flag=True, help="Let the scene file use files outside its folder.")

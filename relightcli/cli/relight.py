@@ -28,6 +28,13 @@ from relightcli.cli import options
     metavar="MATERIAL[.PARAMETER]=VALUE",
     help="Change a parameter of a material, or (MATERIAL=NAME) make it a measured one.",
 )
+@click.option(
+    "--pose",
+    "poses",
+    multiple=True,
+    metavar="OBJECT=CLIP@SECONDS",
+    help="Pose a skinned object as one of its clips does at a time.",
+)
 @click.option("--frames", default=None, type=options.PATH, help="Keyframes (TOML); output name with ####.")
 @click.option("--layers", is_flag=True, help="Write the parts of the picture as EXR layers.")
 @click.option(

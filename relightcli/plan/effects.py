@@ -1,7 +1,7 @@
 """Which effects a scene calls for, with the evidence.
 
 Names follow interface.md: direct, shadows, one-bounce, two-bounce, specular, fields, pose. This version does not
-simulate the last two; a scene or a user that needs one is told so. Left to itself (`auto`) the plan asks structure
+simulate fields; a scene or a user that needs them is told so. Left to itself (`auto`) the plan asks structure
 first (nothing can block anything), then a pilot (`plan.pilot`): an effect is skipped where leaving it out costs less
 than SKIPPED of the tolerance. Specular lobes cost nothing here: they are integrated when a picture is made.
 """
@@ -19,7 +19,7 @@ from relightcli.errors import InputError
 from relightcli.plan.pilot import Share
 
 KNOWN = ("direct", "shadows", "one-bounce", "two-bounce", "specular", "fields", "pose")
-AVAILABLE = ("direct", "shadows", "one-bounce", "two-bounce", "specular")
+AVAILABLE = ("direct", "shadows", "one-bounce", "two-bounce", "specular", "pose")
 BOUNCES = {"one-bounce": 1, "two-bounce": 2}
 SKIPPED = 0.5  # of the tolerance: what effects that are left out may cost together
 COARSE_ERROR = 0.06  # of interreflections through cells of 11 degrees, where those of 2.8 degrees are taken for true
@@ -84,17 +84,16 @@ def bounces_asked(asked: tuple[str, ...] | None, bounces: int | None) -> int | N
 
 
 def need_static(motions: dict[str, str], asked: tuple[str, ...] | None) -> None:
-    """Raises InputError where an object moves: its effect (fields, pose) is not simulated by this version.
+    """Raises InputError where an object moves as a whole: that needs fields, which this version does not simulate.
 
     Naming the effects (`--effects direct,shadows`) simulates moving objects where the scene file puts them.
     """
     if asked is not None:
         return
     for name, motion in motions.items():
-        if motion != "static":
-            effect = "fields" if motion == "rigid" else "pose"
+        if motion == "rigid":
             raise InputError(
-                f"objects.{name}.motion is {motion!r}: this needs the effect '{effect}', which this version does not "
+                f"objects.{name}.motion is {motion!r}: this needs the effect 'fields', which this version does not "
                 'simulate; use motion = "static", or --effects direct,shadows to keep the object where it stands'
             )
 
@@ -174,6 +173,18 @@ def _bounce(name: str, number: int, tails: Sequence[Share], bounces: int, allowe
 
 def _text(share: Share, allowed: float) -> str:
     return f"at most {share.bound:.2%} of the light ({share.where}); {allowed:.2%} may be left out"
+
+
+def decide_pose(asked: tuple[str, ...] | None, clips: dict[str, int]) -> Decision:
+    """Whether skinned objects are posed. clips: how many each of them has."""
+    moving = [name for name, count in clips.items() if count]
+    if not clips:
+        return Decision("pose", False, "no object is skinned")
+    if not moving:
+        return Decision("pose", False, f"no clip moves {', '.join(clips)}")
+    if asked is not None and "pose" not in asked:
+        return Decision("pose", False, "not asked for: skinned objects stand in their rest pose")
+    return Decision("pose", True, f"skinned: {', '.join(moving)}")
 
 
 def _shadows(

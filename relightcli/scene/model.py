@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,8 @@ class ObjectSpec:
     transform: NDArray[np.float64]  # (4, 4), row-major, acts on column vectors
     two_sided: bool = False
     motion: MotionName = "static"
+    motion_files: tuple[Path, ...] = ()  # skinned: BVH files, each a clip of its name
+    joint_map: Path | None = None  # which of their joints moves which node
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,8 @@ class Geometry:
     two_sided     (O,) bool per object
     textures      per material index: (H, W, 3) float32 linear RGB, for materials that have one
     notes         what was repaired or left out while loading, for the user to read
+    rigs          of skinned objects, by name: `core.pose.rig.Rig`; its vertices are the object's, in order. The
+                  arrays above hold the object as posed, in the rest pose unless something else is said
     """
 
     object_names: tuple[str, ...]
@@ -118,3 +122,4 @@ class Geometry:
     two_sided: NDArray[np.bool_]
     textures: dict[int, NDArray[np.float32]]
     notes: tuple[str, ...] = ()
+    rigs: dict[str, Any] = field(default_factory=dict)

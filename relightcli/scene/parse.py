@@ -106,7 +106,8 @@ def _existing_file(folder: Path, written: str, kind: str, allow_outside: bool) -
 
 
 def _object(name: str, table: Table, materials: dict[str, Any]) -> ObjectSpec:
-    table.only(("mesh", "material", "translate", "rotate", "scale", "transform", "two_sided", "motion"))
+    keys = ("mesh", "material", "translate", "rotate", "scale", "transform", "two_sided", "motion")
+    table.only((*keys, "motion_files", "joint_map"))
     material = table.string("material")
     if material not in materials:
         known = f"one of {', '.join(materials)}" if materials else "a material, and the file defines none"
@@ -118,7 +119,27 @@ def _object(name: str, table: Table, materials: dict[str, Any]) -> ObjectSpec:
         transform=_transform(table),
         two_sided=table.boolean("two_sided", False),
         motion=cast(MotionName, table.choice("motion", _MOTIONS, "static")),
+        **_captured(table),
     )
+
+
+def _captured(table: Table) -> dict[str, Any]:
+    """`motion_files` and `joint_map`, which skinned objects may have, both or neither."""
+    for key in ("motion_files", "joint_map"):
+        if key in table.data and table.data.get("motion") != "skinned":
+            table.refuse(key, 'expected it beside motion = "skinned" only.')
+    if "motion_files" not in table.data and "joint_map" not in table.data:
+        return {}
+    written = table.data.get("motion_files")
+    if not isinstance(written, list) or not written or not all(isinstance(name, str) and name for name in written):
+        table.fail("motion_files", "a list of BVH files")
+    files = []
+    for name in written:
+        try:
+            files.append(table.resolve(name, "a BVH file"))
+        except InputError as error:
+            table.refuse("motion_files", str(error))
+    return {"motion_files": tuple(files), "joint_map": table.path("joint_map", "a joint map (TOML)")}
 
 
 def _transform(table: Table) -> NDArray[np.float64]:

@@ -16,6 +16,8 @@ def scene_inputs(scene: Scene) -> dict[str, str]:
     """
     meshes = {o.mesh for o in scene.objects.values()}
     files = {scene.path} | meshes | {buffer for mesh in meshes for buffer in buffer_files(mesh)}
+    for spec in scene.objects.values():
+        files |= {*spec.motion_files, *([spec.joint_map] if spec.joint_map else [])}
     files |= {m.diffuse_texture for m in scene.materials.values() if m.diffuse_texture is not None}
     return {_short(path, scene.path.parent): formats.fingerprint_file(path) for path in sorted(files)}
 

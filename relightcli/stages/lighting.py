@@ -23,13 +23,14 @@ from relightcli.core.transport.receivers import receivers_of_vertices
 from relightcli.errors import InputError, StoreError
 from relightcli.scene.describe import scene_from_json
 from relightcli.scene.model import Geometry, Material, Scene
+from relightcli.stages.rig_store import read_rigs
 
 if TYPE_CHECKING:
     from relightcli.core.shade.gather import Gather
 
 IN_MEMORY = 1 << 30  # visibility up to this size stays in memory between frames
 ENTRIES = 1 << 23  # of pixels' gathers that are made at a time
-KINDS = ("transfer", "clusters", "asset", "light_clusters")
+KINDS = ("transfer", "clusters", "asset", "light_clusters", "pose")
 BLACK = (0.0, 0.0, 0.0)
 
 
@@ -86,6 +87,7 @@ def read_scene(store: formats.Store) -> tuple[Scene, Geometry]:
         read("objects/material"),
         read("objects/two_sided"),
         textures,
+        rigs=read_rigs(store),
     )
     return scene, geometry
 
@@ -141,6 +143,15 @@ class LightingStore:
         raise InputError(
             f"--from {previous}: needs a store of clustered lights, which cluster --light-resolution makes"
         )
+
+    def set_poses(self, poses: tuple[str, ...]) -> list[str]:
+        """Poses skinned objects; notes about it. Raises InputError where a store cannot."""
+        if poses:
+            raise InputError(
+                f"--pose: {self.store.path} lights its objects where they stood when it was made; add --reference, or "
+                "pose what fit-pose made of it"
+            )
+        return []
 
     def put_light(self, writer: formats.Writer) -> None:
         """Writes what a later `resume` needs, if anything."""

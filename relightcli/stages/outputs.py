@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from relightcli.adapters import images
 from relightcli.adapters.files import need_output
 from relightcli.errors import InputError
-from relightcli.scene.model import Camera, Scene
+from relightcli.scene.model import Camera, Geometry, Scene
+from relightcli.scene.posing import resolve_poses
 from relightcli.scene.settings import apply_settings
 from relightcli.stages.shots import Shot
 
@@ -32,6 +33,7 @@ class Config:
     env_rotate: float = 0.0
     camera: str | None = None
     settings: tuple[str, ...] = ()
+    poses: tuple[str, ...] = ()
     frames: Path | None = None
     previous: Path | None = None
     layers: bool = False
@@ -92,6 +94,19 @@ def check_shots(config: Config, shots: list[Shot], scene: Scene) -> None:
             if config.frames is None:
                 raise
             raise InputError(f"{config.frames}: frame {shot.number}: {error}") from None
+
+
+def check_poses(config: Config, shots: list[Shot], scene: Scene, geometry: Geometry) -> list[str]:
+    """Look at the poses of every frame; what there is to say about them. Raises InputError as `check_shots`."""
+    notes: dict[str, None] = {}
+    for shot in shots:
+        try:
+            notes |= dict.fromkeys(resolve_poses(scene, geometry, shot.poses)[1])
+        except InputError as error:
+            if config.frames is None:
+                raise
+            raise InputError(f"{config.frames}: frame {shot.number}: {error}") from None
+    return list(notes)
 
 
 def layer_names(count: int) -> list[str]:

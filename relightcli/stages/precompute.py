@@ -28,6 +28,7 @@ from relightcli.scene.build import build_geometry, scene_to_json
 from relightcli.scene.model import Geometry, Scene
 from relightcli.scene.parse import load_scene
 from relightcli.stages.inputs import scene_inputs
+from relightcli.stages.pose_job import check_pose_options, choose_frames, simulate_poses
 from relightcli.stages.promise import keep_promise, try_resolutions
 from relightcli.stages.receiver_setup import (
     MOST_PIXEL_GRID,
@@ -42,9 +43,11 @@ from relightcli.stages.receiver_setup import (
     unburied,
     with_vertices,
 )
+from relightcli.stages.rig_store import put_rigs
 from relightcli.stages.visibility_job import VisibilityJob, block_size, create_outputs
 
 KIND = "transfer"
+MOVING = ("fields", "pose")
 BASES = ("visibility", "haar", "sh", "dense")
 RESOLUTION = 64  # texels along a face of the light's cube, unless asked for or chosen
 PILOT_GROUPS = 24  # groups of receivers that a dry run traces
@@ -72,6 +75,10 @@ class Config:
     sh_order: int = 6
     bounces: int | None = None
     bounce_resolution: int | None = None
+    pose_frames: str = "spread:200"
+    pose_order: int = 4
+    pose_directions: int = 1024
+    pose_surroundings: bool = False
     seed: int = 0
     workers: int = 1
     overwrite: bool = False
@@ -112,7 +119,11 @@ def precompute(config: Config) -> dict[str, Any]:
     planning = time.perf_counter() - clock
     if bounces:
         _check_bounces(config)
+    plan.append(effects.decide_pose(asked, {name: len(rig.clips) for name, rig in geometry.rigs.items()}))
     simulated = [d.effect for d in plan if d.simulate]
+    moving = [name for name in MOVING if name in simulated]
+    if moving:
+        promise = None  # what moves has its own approximation, which is judged elsewhere
     shadows = "shadows" in simulated
     bounce_cells = 0
     if "one-bounce" in simulated:
@@ -125,7 +136,7 @@ def precompute(config: Config) -> dict[str, Any]:
     tried: list[tuple[int, pilot.Share]] = []
     resolution = config.light_resolution or RESOLUTION
     if config.light_resolution is None and promise is not None and shadows:
-        receivers, buried = _receivers(config, scene, source, geometry, both, shadows, bool(bounce_cells))
+        receivers, buried = _receivers(config, scene, source, geometry, both, plan, bool(bounce_cells))
         tried = try_resolutions(config, scene, source, geometry, receivers, buried, promise)
         resolution = tried[-1][0]
     if config.dry_run:
@@ -148,6 +159,13 @@ def precompute(config: Config) -> dict[str, Any]:
         settings["bounce_resolution"] = bounce_cells
     if config.basis == "haar":
         settings |= {"coefficients": config.coefficients, "tolerance": config.tolerance}
+    if "pose" in simulated:
+        settings |= {
+            "pose_frames": config.pose_frames,
+            "pose_order": config.pose_order,
+            "pose_directions": config.pose_directions,
+            "pose_surroundings": config.pose_surroundings,
+        }
     if config.basis == "sh":
         settings["sh_order"] = config.sh_order
     writer = formats.begin(
@@ -162,7 +180,7 @@ def precompute(config: Config) -> dict[str, Any]:
         return {"store": str(config.output), "status": "up to date", "notes": list(geometry.notes)}
     with writer:
         resumed = bool(writer.done)
-        receivers, buried = _receivers(config, scene, source, geometry, both, shadows, bool(bounce_cells))
+        receivers, buried = _receivers(config, scene, source, geometry, both, plan, bool(bounce_cells))
         points = receivers.points if isinstance(receivers, PixelReceivers) else receivers
         writer.set_attrs(
             {
@@ -174,6 +192,7 @@ def precompute(config: Config) -> dict[str, Any]:
             }
         )
         put_geometry(writer, geometry)
+        put_rigs(writer, geometry)
         if geometry is not source:
             writer.put("source/face", source.faces, dims=("face", "corner"))
         put_receivers(writer, receivers, buried)
@@ -192,6 +211,7 @@ def precompute(config: Config) -> dict[str, Any]:
             tuple(scene.lights.values()),
             bounce_cells,
             int(np.count_nonzero(points.vertex < 0)),
+            _posed(geometry, plan),
         )
         create_outputs(writer, job, len(receivers))
         run.run_blocks(
@@ -203,6 +223,18 @@ def precompute(config: Config) -> dict[str, Any]:
             quiet=config.quiet,
         )
         run.close_worker()
+        if "pose" in simulated:
+            simulate_poses(
+                writer,
+                scene,
+                geometry,
+                config.pose_frames,
+                config.pose_order,
+                config.pose_directions,
+                config.pose_surroundings,
+                config.workers,
+                config.quiet,
+            )
         if promise is not None:
             keep_promise(config, promise, resolution, scene, source, geometry, receivers, buried, writer)
         writer.commit({"seconds": time.perf_counter() - started, "resumed": resumed, "workers": config.workers})
@@ -253,6 +285,7 @@ def _check(config: Config) -> None:
         raise InputError(f"--pixel-grid: expected 1 to {MOST_PIXEL_GRID}; found {config.pixel_grid}")
     if config.pixel_grid != 1 and config.receivers == "vertices":
         raise InputError("--pixel-grid: needs --receivers pixels:CAMERA")
+    check_pose_options(config.pose_frames, config.pose_order, config.pose_directions)
     if config.bounces is not None and not 0 <= config.bounces <= MOST_BOUNCES:
         raise InputError(f"--bounces: expected 0 to {MOST_BOUNCES}; found {config.bounces}")
 
@@ -281,7 +314,7 @@ def _receivers(
     source: Geometry,
     geometry: Geometry,
     both: NDArray[np.bool_],
-    shadows: bool,
+    plan: list[effects.Decision],
     bounces: bool,
 ) -> tuple[Receivers | PixelReceivers, NDArray[np.bool_] | None]:
     """The receivers, and which of them are buried, (N,), where there are any on vertices.
@@ -294,11 +327,19 @@ def _receivers(
         return asked, None
     vertices = on_vertices(geometry, both) if isinstance(asked, PixelReceivers) else asked
     buried = np.zeros(len(vertices), bool)
+    shadows = any(d.effect == "shadows" and d.simulate for d in plan)
     if shadows and not config.dry_run:
-        vertices, buried = unburied(geometry, vertices)
+        vertices, buried = unburied(geometry, vertices, _posed(geometry, plan))
     if isinstance(asked, PixelReceivers):
         return with_vertices(asked, vertices), np.concatenate([np.zeros(len(asked), bool), buried])
     return vertices, buried
+
+
+def _posed(geometry: Geometry, plan: list[effects.Decision]) -> tuple[int, ...]:
+    """Objects that will stand otherwise when pictures are made: they block nothing for the receivers of others."""
+    if not any(d.effect == "pose" and d.simulate for d in plan):
+        return ()
+    return tuple(geometry.object_names.index(name) for name, rig in geometry.rigs.items() if rig.clips)
 
 
 def _both_sides(scene: Scene, geometry: Geometry) -> NDArray[np.bool_]:
@@ -367,7 +408,7 @@ def _dry_run(
 
     The bytes are an upper bound: the mesh counts uncompressed, and the pilot's bits compress worse in small groups.
     """
-    receivers, _ = _receivers(config, scene, source, geometry, both, shadows, bool(bounce_cells))
+    receivers, _ = _receivers(config, scene, source, geometry, both, plan, bool(bounce_cells))
     points = receivers.points if isinstance(receivers, PixelReceivers) else receivers
     spent = {"shadows": np.zeros(3), "one-bounce": np.zeros(3)}  # rays, seconds, bytes
     if shadows and len(points):
@@ -396,7 +437,17 @@ def _dry_run(
         for cost in spent.values():
             cost *= len(points) / pilot_receivers
             cost[1] /= max(1, config.workers)
-    rays, seconds, packed = spent["shadows"] + spent["one-bounce"]
+    if "pose" in [d.effect for d in plan if d.simulate]:
+        samples = sum(
+            len(choose_frames(rig, config.pose_frames)) * len(rig.position)
+            for rig in geometry.rigs.values()
+            if rig.clips
+        )
+        traced, took, _ = spent["shadows"]
+        rate = took / traced if traced else 0.0  # seconds a ray
+        cast = samples * config.pose_directions
+        spent["pose"] = np.array([cast, cast * rate, 4.0 * samples * config.pose_order**2])
+    rays, seconds, packed = sum(spent.values(), np.zeros(3))
     rows_of_plan = [_row(d) for d in plan]
     for row in rows_of_plan:
         if row["simulate"] and row["effect"] in spent:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,16 +125,31 @@ def surfaces_of(geometry: Geometry, points: Receivers, buried: NDArray[np.bool_]
     return Surfaces(geometry.positions, geometry.normals, geometry.faces, two_sided, front, back, buried)
 
 
-def unburied(geometry: Geometry, points: Receivers) -> tuple[Receivers, NDArray[np.bool_]]:
-    """Vertex receivers, those that nothing can see moved to where something can; and which are left, (N,) bool."""
-    return unbury(
-        Tracer(geometry.positions, geometry.faces),
-        points,
-        geometry.positions,
-        geometry.faces,
-        primary.face_normals(geometry.positions, geometry.faces),
-        geometry.two_sided[geometry.face_object],
-    )
+def hidden(faces: NDArray[np.int32], owner: NDArray[np.int32], objects: tuple[int, ...]) -> NDArray[np.int32]:
+    """Faces (F, 3) of owners (F,), in which those of some objects have no area: they block nothing, indices stay."""
+    out = faces.copy()
+    own = np.isin(owner, objects)
+    out[own] = faces[own][:, :1]
+    return out
+
+
+def unburied(geometry: Geometry, points: Receivers, posed: tuple[int, ...] = ()) -> tuple[Receivers, NDArray[np.bool_]]:
+    """Vertex receivers, those that nothing can see moved to where something can; and which are left, (N,) bool.
+
+    posed: objects that are not there for the receivers of the others.
+    """
+    position, buried = points.position.copy(), np.zeros(len(points), bool)
+    normals = primary.face_normals(geometry.positions, geometry.faces)
+    two_sided = geometry.two_sided[geometry.face_object]
+    of_posed = np.isin(points.object, posed)
+    for own, absent in ((~of_posed, posed), (of_posed, ())):
+        if not own.any():
+            continue
+        some = Receivers(*(getattr(points, field.name)[own] for field in fields(Receivers)))
+        tracer = Tracer(geometry.positions, hidden(geometry.faces, geometry.face_object, absent))
+        moved, buried[own] = unbury(tracer, some, geometry.positions, geometry.faces, normals, two_sided)
+        position[own] = moved.position
+    return replace(points, position=position), buried
 
 
 def put_geometry(writer: formats.Writer, geometry: Geometry) -> None:

@@ -21,11 +21,13 @@ from relightcli.run import blocks as run
 from relightcli.scene.build import build_geometry
 from relightcli.scene.model import Geometry, Scene
 from relightcli.scene.parse import load_scene
+from relightcli.scene.posing import apply_poses
 from relightcli.scene.settings import apply_settings
 from relightcli.stages.inputs import scene_inputs
 from relightcli.stages.lighting import read_scene
 from relightcli.stages.outputs import (
     Config,
+    check_poses,
     check_shots,
     layer_names,
     numbered,
@@ -53,6 +55,7 @@ class ReferenceJob:
     background: bool
     seed: int
     allow_outside: bool
+    poses: tuple[str, ...] = ()
 
     def open(self) -> ReferenceWorker:
         return ReferenceWorker(self)
@@ -62,6 +65,7 @@ class ReferenceWorker:
     def __init__(self, job: ReferenceJob) -> None:
         self.job = job
         scene, geometry, _, _ = open_source(Path(job.source), job.allow_outside)
+        geometry, _ = apply_poses(scene, geometry, job.poses)
         materials = apply_settings(scene.materials, job.settings)
         self.camera = scene.cameras[job.camera]
         self.scene = shading_scene(geometry, list(materials.values()), scene.lights.values())
@@ -102,11 +106,11 @@ def open_source(path: Path, allow_outside: bool = False) -> tuple[Scene, Geometr
 
 def render_reference(config: Config, shots: list[Shot], suffix: str, started: float) -> dict[str, Any]:
     """Path-traces every shot. Samples accumulate in `OUTPUT.samples.partial` until the picture is written."""
-    scene, _, fingerprint, own_bounces = open_source(config.store, config.allow_outside)
+    scene, geometry, fingerprint, own_bounces = open_source(config.store, config.allow_outside)
     check_shots(config, shots, scene)
+    notes = check_poses(config, shots, scene, geometry)
     bounces = own_bounces if config.bounces is None else config.bounces
     written, rays = [], 0
-    notes: list[str] = []
     for shot in shots:
         environment = resolve_environment(shot.env, scene.environments)
         camera = resolve_camera(shot.camera, scene.cameras)
@@ -126,6 +130,8 @@ def render_reference(config: Config, shots: list[Shot], suffix: str, started: fl
             "background": config.background,
             "seed": config.seed,
         }
+        if shot.poses:
+            settings["pose"] = list(shot.poses)
         writer = formats.begin(
             samples,
             "samples",
@@ -152,6 +158,7 @@ def render_reference(config: Config, shots: list[Shot], suffix: str, started: fl
                     config.background,
                     config.seed,
                     config.allow_outside,
+                    shot.poses,
                 )
                 run.run_blocks(
                     job,
@@ -186,6 +193,8 @@ def render_reference(config: Config, shots: list[Shot], suffix: str, started: fl
             "relight:reference_spp": passes * per_pass,
             "relight:bounces": bounces,
         }
+        if shot.poses:
+            metadata["relight:pose"] = " ".join(shot.poses)
         written.append(put_picture(config, shot, suffix, pixels, extra, metadata))
         remove_store(samples)
     return {

@@ -8,7 +8,15 @@ from typing import Any
 
 import relight_formats as formats
 from relightcli.stages.lighting import LightingStore
-from relightcli.stages.outputs import Config, check, check_shots, numbered, output_suffix, resolve_environment
+from relightcli.stages.outputs import (
+    Config,
+    check,
+    check_poses,
+    check_shots,
+    numbered,
+    output_suffix,
+    resolve_environment,
+)
 from relightcli.stages.session import Session
 from relightcli.stages.shots import Shot, read_shots
 
@@ -20,7 +28,7 @@ def relight(config: Config) -> dict[str, Any]:
     started = time.perf_counter()
     suffix = output_suffix(config.output)
     check(config, suffix)
-    default = Shot(1, config.env, config.env_rotate, config.camera, config.exposure, config.settings)
+    default = Shot(1, config.env, config.env_rotate, config.camera, config.exposure, config.settings, config.poses)
     shots = [default] if config.frames is None else read_shots(config.frames, default)
     if config.reference:
         from relightcli.stages.reference import render_reference
@@ -28,6 +36,12 @@ def relight(config: Config) -> dict[str, Any]:
         return render_reference(config, shots, suffix, started)
     lighting = open_lighting(config.store, config.workers)
     check_shots(config, shots, lighting.scene)
+    for shot in shots:
+        if shot.poses:  # whether the store poses at all, before anything is written
+            check_poses(config, shots, lighting.scene, lighting.geometry)
+            lighting.set_poses(shot.poses)
+            lighting.set_poses(())
+            break
     if config.previous is not None:
         lighting.resume(config.previous)
     if config.dry_run:
@@ -65,6 +79,10 @@ def open_lighting(path: Path, threads: int) -> LightingStore:
         from relightcli.stages.clustered import ClusteredStore
 
         return ClusteredStore(store, threads)
+    if store.kind == "pose":
+        from relightcli.stages.posed import PoseStore
+
+        return PoseStore(store, threads)
     return LightingStore(store, threads)
 
 

@@ -61,9 +61,12 @@ class Session:
         self._map: tuple[Path, NDArray[np.float32]] | None = None
         self._radiance: list[NDArray[np.float32]] = []
         self._last: tuple[object, ...] = ()
+        self._poses: tuple[str, ...] | None = None
+        self._positions: list[NDArray[np.float64]] = []
         self._seconds: dict[str, list[float]] = {}
 
     def write(self, shot: Shot, suffix: str) -> str:
+        self._pose(shot.poses)
         materials = apply_settings(self.lighting.scene.materials, shot.settings)
         if suffix in PICTURES:
             with ThreadPoolExecutor(1) as reader:  # the map is read while the view is made
@@ -81,7 +84,17 @@ class Session:
         if suffix == ".ply":
             return self._write_ply(shot, total)
         self._radiance.append(total)
+        self._positions.append(self.lighting.position)
         return self.config.output
+
+    def _pose(self, poses: tuple[str, ...]) -> None:
+        """Poses objects; what was seen of others is not kept."""
+        if poses == self._poses or (self._poses is None and not poses):
+            return
+        self._poses = poses
+        self.notes.extend(n for n in self.lighting.set_poses(poses) if n not in self.notes)
+        self._views.clear()
+        self._tracer = None
 
     def _environment(self, shot: Shot) -> NDArray[np.float32]:
         path = resolve_environment(shot.env, self.lighting.scene.environments)
@@ -197,6 +210,8 @@ class Session:
             "relight:set": " ".join(shot.settings),
             "relight:bounces": self.lighting.bounces if config.bounces is None else config.bounces,
         }
+        if shot.poses:
+            metadata["relight:pose"] = " ".join(shot.poses)
         return put_picture(config, shot, suffix, pixels, layers, metadata)
 
     def _write_ply(self, shot: Shot, radiance: NDArray[np.float32]) -> str:
@@ -232,6 +247,7 @@ class Session:
                 "basis": config.basis,
                 "bounces": config.bounces,
                 "frames": None if config.frames is None else formats.fingerprint_file(config.frames),
+                **({"pose": list(config.poses)} if config.poses else {}),
             },
             inputs={"store": store.fingerprint, **self._maps, **previous},
             program=f"relightcli {__version__}",
@@ -241,7 +257,11 @@ class Session:
             return
         with writer:
             writer.put("radiance", radiance, dims=("frame", "receiver", "colour"), units="W sr-1 m-2")
-            writer.put("receivers/position", self.lighting.position, dims=("receiver", "axis"), units="m")
+            if self._poses is None:
+                writer.put("receivers/position", self.lighting.position, dims=("receiver", "axis"), units="m")
+            else:
+                posed = np.stack(self._positions)
+                writer.put("receivers/position", posed, dims=("frame", "receiver", "axis"), units="m")
             self.lighting.put_light(writer)
             writer.commit({})
 

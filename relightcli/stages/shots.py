@@ -10,13 +10,15 @@
     env_rotate = 0                  # degrees; this and everything below is interpolated linearly between keys
     exposure = 0
     set = { "gold.roughness" = 0.2, "red.diffuse" = [0.6, 0.1, 0.1], "floor" = "blue-acrylic" }
+    pose = { man = "walk@0" }       # the clip holds until the next; seconds are interpolated between keys of one clip
 
     [[key]]
     frame = 25                      # keys may lie beyond the last frame: a full turn in 24 frames without a double
     env_rotate = 360
 
 Before a value's first key it has that key's value, after its last key that one's. A measured material (a text in `set`)
-holds until the next one of the same material; numbers change it further, whichever stands first.
+holds until the next one of the same material; numbers change it further, whichever stands first. Between keys of
+different clips an object stands still in the pose of the former.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ from typing import Any
 
 from relightcli.errors import InputError
 from relightcli.scene.fields import describe, is_number
+from relightcli.scene.posing import parse_pose
 from relightcli.scene.settings import measured_fit
 
 MOST_FRAMES = 100_000
@@ -46,6 +49,7 @@ class Shot:
     camera: str | None
     exposure: float
     settings: tuple[str, ...]
+    poses: tuple[str, ...] = ()  # as `--pose` takes them; of several for one object the last holds
 
 
 def read_shots(path: Path, default: Shot) -> list[Shot]:
@@ -63,7 +67,7 @@ def read_shots(path: Path, default: Shot) -> list[Shot]:
     previous = None
     for i, key in enumerate(keys):
         where = f"key[{i}]"
-        _known(path, where, key, {"frame", "set", *STEPPED, *NUMBERS})
+        _known(path, where, key, {"frame", "set", "pose", *STEPPED, *NUMBERS})
         frame = _number(path, f"{where}.frame", key.get("frame"))
         if previous is not None and frame <= previous:
             raise InputError(f"{path}: {where}.frame: expected more than {previous:g}, the key before; found {frame:g}")
@@ -81,6 +85,17 @@ def read_shots(path: Path, default: Shot) -> list[Shot]:
             raise InputError(f"{path}: {where}.set: expected a table; found {changes!r}")
         for name, value in changes.items():
             _add_setting(path, f"{where}.set.{name}", tracks.setdefault(f"set.{name}", []), frame, value)
+        poses = key.get("pose", {})
+        if not isinstance(poses, dict):
+            raise InputError(f"{path}: {where}.pose: expected a table; found {poses!r}")
+        for name, value in poses.items():
+            if not isinstance(value, str):
+                raise InputError(f"{path}: {where}.pose.{name}: expected a text CLIP@SECONDS; found {describe(value)}")
+            try:
+                pose = parse_pose(f"{name}={value}")
+            except InputError as error:
+                raise InputError(f"{path}: {where}.pose.{name}: {error}") from None
+            tracks.setdefault(f"pose.{name}", []).append((frame, (pose.clip, pose.seconds)))
     return [_shot(path, first + i, tracks, default) for i in range(count)]
 
 
@@ -123,7 +138,21 @@ def _shot(path: Path, number: int, tracks: dict[str, list[tuple[float, Any]]], d
         _held(tracks.get("camera"), number) or default.camera,
         exposure[0] if exposure else default.exposure,
         (*default.settings, *names, *numbers),
+        (*default.poses, *(_pose(n.removeprefix("pose."), t, number) for n, t in tracks.items() if n[:5] == "pose.")),
     )
+
+
+def _pose(name: str, track: list[tuple[float, Any]], number: int) -> str:
+    """The pose of one object at a frame, as `--pose` takes it."""
+    clip, seconds = track[0][1]
+    for (a, (clip_a, from_)), (b, (clip_b, to)) in itertools.pairwise(track):
+        if a <= number:
+            clip, seconds = clip_a, from_
+            if number < b and clip_a == clip_b:
+                seconds = from_ + (to - from_) * (number - a) / (b - a)
+    if number >= track[-1][0]:
+        clip, seconds = track[-1][1]
+    return f"{name}={clip}@{seconds!r}"
 
 
 def _is_text(track: list[tuple[float, Any]]) -> bool:

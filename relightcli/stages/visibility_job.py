@@ -19,6 +19,7 @@ from relightcli.core.transport.local_lights import pack_lights
 from relightcli.core.transport.receivers import receivers_of_vertices
 from relightcli.run import blocks as run
 from relightcli.scene.model import RectangleLight, SphereLight
+from relightcli.stages.receiver_setup import hidden
 
 CHUNK_BYTES = 4_000_000
 
@@ -39,6 +40,7 @@ class VisibilityJob:
     lights: tuple[SphereLight | RectangleLight, ...]
     bounce_cells: int  # cells along a side of the cube of what is seen; 0: no interreflections
     pixels: int = 0  # receivers before the first that is on a vertex
+    posed: tuple[int, ...] = ()  # objects that only their own receivers see, in the pose in which they stand
 
     def open(self) -> VisibilityWorker:
         return VisibilityWorker(self)
@@ -52,7 +54,13 @@ class VisibilityWorker:
             return formats.worker_array(job.partial, name)
 
         self.position, self.normal = array("receivers/position"), array("receivers/normal")
-        self.tracer = Tracer(array("mesh/position")[:], array("mesh/face")[:]) if job.shadows else None
+        self.object = array("receivers/object") if job.posed else None
+        self.tracer = self.still = None
+        if job.shadows:
+            mesh, faces = array("mesh/position")[:], array("mesh/face")[:]
+            self.tracer = self.still = Tracer(mesh, faces)
+            if job.posed:
+                self.still = Tracer(mesh, hidden(faces, array("mesh/face_object")[:], job.posed))
         self.out = {name: array(name) for name in _outputs(job)}
         self.lights = pack_lights(job.lights)
         self.surfaces = _surfaces(array) if job.bounce_cells else None
@@ -63,23 +71,14 @@ class VisibilityWorker:
         job, rows = self.job, slice(block.start, block.stop)
         position, normal = self.position[rows], self.normal[rows]
         info: run.Info = {"rays": 0.0, "checked": 0.0, "wrong": 0.0, "inferred": 0.0, "bits": 0.0}
-        start = time.perf_counter()
-        if self.tracer is None:
-            bits = visibility.horizon_bits(normal, job.resolution)
-        else:
-            bits = self._trace(self.tracer, block.start, position, normal, info)
-        if self.lights.number:
-            self.out["lights/bits"][rows], rays = light_bits(self.tracer, self.lights, position, normal)
-            info["rays"] += float(rays)
-        info["trace_seconds"] = time.perf_counter() - start
-        self.out["visibility/bits"][rows] = bits
-        if self.surfaces is not None and self.tracer is not None:
-            start = time.perf_counter()
-            self.out["bounce/hit"][rows], rays = trace_hits(
-                self.tracer, self.surfaces, position, normal, bits, job.bounce_cells, block.start, job.seed
-            )
-            info |= {"bounce_rays": float(rays), "bounce_seconds": time.perf_counter() - start}
-            info["rays"] += float(rays)
+        parts = []
+        for tracer, some in self._parts(rows):
+            found = self._seen(tracer, block.start, np.arange(len(position))[some], position[some], normal[some], info)
+            parts.append((some, found))
+        seen = parts[0][1] if len(parts) == 1 else _joined(parts)
+        bits = seen["visibility/bits"]
+        for name, values in seen.items():
+            self.out[name][rows] = values
         if job.basis == "sh":
             self.out["direct/sh"][rows] = sh.cosine_transfer(bits, normal, job.sh_order)
         elif job.basis == "haar":
@@ -93,17 +92,56 @@ class VisibilityWorker:
             self.out["direct/dense"][rows] = _dense(bits, normal, self.directions, self.solid_angle)
         return info
 
+    def _parts(self, rows: slice) -> list[tuple[Tracer | None, slice | NDArray[np.bool_]]]:
+        """Ray tracers, and which of these receivers see what is in them."""
+        if self.object is None:
+            return [(self.tracer, slice(None))]
+        own = np.isin(self.object[rows], self.job.posed)
+        return [(t, some) for t, some in ((self.still, ~own), (self.tracer, own)) if some.any()]
+
+    def _seen(
+        self,
+        tracer: Tracer | None,
+        first: int,
+        place: NDArray[np.intp],
+        position: NDArray[np.float64],
+        normal: NDArray[np.float32],
+        info: dict[str, float],
+    ) -> dict[str, NDArray[Any]]:
+        """What the receivers at `place` of the block from `first` on see of sky, lights and surfaces, by array."""
+        job = self.job
+        start = time.perf_counter()
+        if tracer is None:
+            bits = visibility.horizon_bits(normal, job.resolution)
+        else:
+            bits = self._trace(tracer, first, place, position, normal, info)
+        out: dict[str, NDArray[Any]] = {"visibility/bits": bits}
+        if self.lights.number:
+            out["lights/bits"], rays = light_bits(tracer, self.lights, position, normal)
+            info["rays"] += float(rays)
+        info["trace_seconds"] = info.get("trace_seconds", 0.0) + time.perf_counter() - start
+        if self.surfaces is not None and tracer is not None:
+            start = time.perf_counter()
+            out["bounce/hit"], rays = trace_hits(
+                tracer, self.surfaces, position, normal, bits, job.bounce_cells, first, job.seed
+            )
+            info["bounce_rays"] = info.get("bounce_rays", 0.0) + float(rays)
+            info["bounce_seconds"] = info.get("bounce_seconds", 0.0) + time.perf_counter() - start
+            info["rays"] += float(rays)
+        return out
+
     def _trace(
         self,
         tracer: Tracer,
         first: int,
+        place: NDArray[np.intp],
         position: NDArray[np.float64],
         normal: NDArray[np.float32],
         info: dict[str, float],
     ) -> NDArray[np.uint8]:
-        """Visibility bits of the receivers from `first` on; pixels and vertices apart, as if they were alone."""
+        """Visibility bits of receivers of the block from `first` on; pixels and vertices apart, as if alone."""
         job = self.job
-        cut = min(max(job.pixels - first, 0), len(position))
+        cut = int(np.searchsorted(place, job.pixels - first))
         bits = []
         for rows in (slice(0, cut), slice(cut, len(position))):
             if rows.start == rows.stop:
@@ -117,6 +155,16 @@ class VisibilityWorker:
             info["inferred"] += float(traced.inferred)
             info["bits"] += float(3 * job.resolution**2 * len(traced.bits))
         return bits[0] if len(bits) == 1 else np.concatenate(bits)
+
+
+def _joined(parts: list[tuple[Any, dict[str, NDArray[Any]]]]) -> dict[str, NDArray[Any]]:
+    """One array of each name, its rows put together from parts."""
+    out = {}
+    for name, values in parts[0][1].items():
+        out[name] = np.empty((len(parts[0][0]), *values.shape[1:]), values.dtype)
+        for some, found in parts:
+            out[name][some] = found[name]
+    return out
 
 
 def _surfaces(array: Any) -> Surfaces:

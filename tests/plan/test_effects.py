@@ -12,6 +12,7 @@ from relightcli.plan.effects import (
     bounces_asked,
     bounces_needed,
     decide,
+    decide_pose,
     need_static,
     parse_effects,
 )
@@ -46,12 +47,29 @@ def test_names_that_are_refused(text, message):
         parse_effects(text)
 
 
-def test_moving_objects_need_effects_that_are_not_there():
+def test_moving_objects_need_an_effect_that_is_not_there():
     need_static({"a": "static"}, None)
     need_static({"a": "rigid"}, ("direct", "shadows"))
-    for motion, effect in (("rigid", "fields"), ("skinned", "pose")):
-        with pytest.raises(InputError, match=f"objects.b.motion is '{motion}'.*'{effect}'"):
-            need_static({"a": "static", "b": motion}, None)
+    need_static({"a": "skinned"}, None)
+    with pytest.raises(InputError, match=r"objects\.b\.motion is 'rigid'.*'fields'"):
+        need_static({"a": "static", "b": "rigid"}, None)
+
+
+@pytest.mark.parametrize(
+    ("asked", "clips", "simulate", "evidence"),
+    [
+        (None, {}, False, "no object is skinned"),
+        (("direct", "pose"), {}, False, "no object is skinned"),
+        (None, {"man": 0}, False, "no clip moves man"),
+        (None, {"man": 0, "fox": 3}, True, "skinned: fox"),
+        (AVAILABLE, {"man": 1}, True, "skinned: man"),
+        (("direct", "shadows"), {"man": 1}, False, "not asked for"),
+    ],
+)
+def test_poses_of_what_has_clips(asked, clips, simulate, evidence):
+    decision = decide_pose(asked, clips)
+    assert decision.simulate == simulate
+    assert decision.evidence.startswith(evidence)
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e6])

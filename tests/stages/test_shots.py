@@ -5,7 +5,7 @@ import pytest
 from relightcli.errors import InputError
 from relightcli.stages.shots import Shot, read_shots
 
-DEFAULT = Shot(1, "sky", 5.0, "main", -1.0, ("gold.f0=0.5",))
+DEFAULT = Shot(1, "sky", 5.0, "main", -1.0, ("gold.f0=0.5",), ("man=none@0",))
 
 
 def shots(tmp_path, text):
@@ -17,7 +17,7 @@ def shots(tmp_path, text):
 def test_without_keys_every_frame_is_the_default(tmp_path):
     found = shots(tmp_path, "frames = 3\nfirst = 7\n")
     assert [s.number for s in found] == [7, 8, 9]
-    assert all(s == Shot(s.number, "sky", 5.0, "main", -1.0, ("gold.f0=0.5",)) for s in found)
+    assert all(s == Shot(s.number, "sky", 5.0, "main", -1.0, ("gold.f0=0.5",), ("man=none@0",)) for s in found)
 
 
 def test_a_turn_without_a_double(tmp_path):
@@ -65,6 +65,15 @@ def test_measured_materials_hold_and_numbers_go_on_top(tmp_path):
     ]
 
 
+def test_poses_go_on_within_a_clip_and_stand_still_between_two(tmp_path):
+    keys = ((2, "walk@0"), (4, "walk@3"), (6, "run@1"), (7, "run@1.5"))
+    text = "".join(f"[[key]]\nframe = {frame}\npose = {{ man = '{pose}' }}\n" for frame, pose in keys)
+    found = shots(tmp_path, "frames = 8\n" + text)
+    poses = [s.poses for s in found]
+    seconds = ["walk@0.0", "walk@0.0", "walk@1.5", "walk@3.0", "walk@3.0", "run@1.0", "run@1.5", "run@1.5"]
+    assert poses == [("man=none@0", f"man={pose}") for pose in seconds]
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -99,6 +108,9 @@ def test_measured_materials_hold_and_numbers_go_on_top(tmp_path):
             "frames = 2\n[[key]]\nframe = 1\nset = { a = 1 }\n[[key]]\nframe = 2\nset = { a = [1, 2, 3] }",
             r"key\[1\].set.a: expected 1 numbers",
         ),
+        ("frames = 2\n[[key]]\nframe = 1\npose = 'x@1'", r"key\[0\].pose: expected a table"),
+        ("frames = 2\n[[key]]\nframe = 1\npose = { a = 1 }", r"key\[0\].pose.a: expected a text CLIP@SECONDS"),
+        ("frames = 2\n[[key]]\nframe = 1\npose = { a = 'x' }", r"key\[0\].pose.a: --pose a=x: expected OBJECT="),
         ("frames = ", "not a TOML file"),
     ],
 )

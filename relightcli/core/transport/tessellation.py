@@ -7,7 +7,7 @@ between four vertices and be lost. An edge is halved while it is longer than
 
 with D the diagonal of its object, D' that of any other one and d the distance from its middle p to that other one:
 shadows are sharp near what casts them and soften with distance. The shape does not change, nor do the first vertices;
-neighbouring faces stay joined, because they share the cut edges.
+neighbouring faces stay joined, because they share the cut edges. Skinned objects keep their faces: those move.
 """
 
 from __future__ import annotations
@@ -53,6 +53,8 @@ class _Limit:
 
     def __init__(self, geometry: Geometry, diagonals: NDArray[np.float64], near: bool) -> None:
         self.widest = diagonals / OBJECT_PARTS
+        self.kept = np.array([name in geometry.rigs for name in geometry.object_names], bool)
+        self.widest[self.kept] = np.inf
         self.nearest = diagonals / NEAR_PARTS
         self.floor = self.widest.copy()
         self.trees: list[Any] = []
@@ -65,6 +67,7 @@ class _Limit:
             self.trees.append(cKDTree(geometry.positions[used]))
             others = np.arange(len(diagonals)) != k
             self.floor[others] = np.minimum(self.floor[others], self.nearest[k])
+        self.floor[self.kept] = np.inf
 
     def exceeded(
         self, middle: NDArray[np.float64], length: NDArray[np.float64], owner: NDArray[np.int32]
@@ -78,6 +81,7 @@ class _Limit:
             ask = np.flatnonzero(~out & (owner != k) & (length > least))
             if len(ask):
                 out[ask] = length[ask] > np.maximum(self.nearest[k], SLOPE * tree.query(middle[ask])[0])
+        out &= ~self.kept[owner]
         return out
 
 
