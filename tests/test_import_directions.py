@@ -12,7 +12,8 @@ import relightcli
 PACKAGE = Path(relightcli.__file__).parent
 
 # What each room may import of the project. `core` and `plan` know the plain records of `scene.model` and nothing else
-# of `scene`; `errors` is the only module that all may import, and the only one below `stages` that knows the store format.
+# of `scene`; `errors` is the only module that all may import, and the only one below `stages` that knows the store
+# format.
 ALLOWED = {
     "cli": {"cli", "stages", "errors", "__version__"},
     "stages": {"stages", "plan", "run", "scene", "adapters", "core", "errors", "relight_formats", "__version__"},
