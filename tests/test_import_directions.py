@@ -62,7 +62,7 @@ def room_of(path):
 
 
 def target(module, room):
-    """Room (scene.model as seen from core and plan) that a module of the project is in; None for other libraries."""
+    """Room (or scene.model, seen from core and plan) that a module of the project belongs to; None for others."""
     parts = module.split(".")
     if parts[0] == "relight_formats":
         return "relight_formats"

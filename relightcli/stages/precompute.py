@@ -47,7 +47,6 @@ from relightcli.stages.rig_store import put_rigs
 from relightcli.stages.visibility_job import VisibilityJob, block_size, create_outputs
 
 KIND = "transfer"
-MOVING = ("fields", "pose")
 BASES = ("visibility", "haar", "sh", "dense")
 RESOLUTION = 64  # texels along a face of the light's cube, unless asked for or chosen
 PILOT_GROUPS = 24  # groups of receivers that a dry run traces
@@ -121,9 +120,11 @@ def precompute(config: Config) -> dict[str, Any]:
         _check_bounces(config)
     plan.append(effects.decide_pose(asked, {name: len(rig.clips) for name, rig in geometry.rigs.items()}))
     simulated = [d.effect for d in plan if d.simulate]
-    moving = [name for name in MOVING if name in simulated]
-    if moving:
-        promise = None  # what moves has its own approximation, which is judged elsewhere
+    if promise is not None and "pose" in simulated:
+        raise InputError(
+            f"--tolerance: {scene.path} has skinned objects, and no error is promised for the light about what moves; "
+            "leave it out, or name effects without pose"
+        )
     shadows = "shadows" in simulated
     bounce_cells = 0
     if "one-bounce" in simulated:
@@ -391,6 +392,15 @@ def _raw_bytes(geometry: Geometry, points: Receivers) -> int:
     return sum(a.nbytes for a in [*arrays, *geometry.textures.values()])
 
 
+def _pose_cost(config: Config, geometry: Geometry, traced: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rays, seconds and bytes of the frames of skinned objects, at the speed of the rays of `traced`."""
+    rigs = [rig for rig in geometry.rigs.values() if rig.clips]
+    samples = sum(len(choose_frames(rig, config.pose_frames)) * len(rig.position) for rig in rigs)
+    rays = samples * config.pose_directions
+    seconds = rays * traced[1] / traced[0] if traced[0] else 0.0
+    return np.array([rays, seconds, 4.0 * samples * config.pose_order**2])
+
+
 def _dry_run(
     config: Config,
     resolution: int,
@@ -437,17 +447,9 @@ def _dry_run(
         for cost in spent.values():
             cost *= len(points) / pilot_receivers
             cost[1] /= max(1, config.workers)
-    if "pose" in [d.effect for d in plan if d.simulate]:
-        samples = sum(
-            len(choose_frames(rig, config.pose_frames)) * len(rig.position)
-            for rig in geometry.rigs.values()
-            if rig.clips
-        )
-        traced, took, _ = spent["shadows"]
-        rate = took / traced if traced else 0.0  # seconds a ray
-        cast = samples * config.pose_directions
-        spent["pose"] = np.array([cast, cast * rate, 4.0 * samples * config.pose_order**2])
-    rays, seconds, packed = sum(spent.values(), np.zeros(3))
+    if any(d.effect == "pose" and d.simulate for d in plan):
+        spent["pose"] = _pose_cost(config, geometry, spent["shadows"])
+    rays, seconds, packed = np.sum(list(spent.values()), axis=0)
     rows_of_plan = [_row(d) for d in plan]
     for row in rows_of_plan:
         if row["simulate"] and row["effect"] in spent:
