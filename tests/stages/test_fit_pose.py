@@ -242,6 +242,7 @@ def test_command_line(transfer, tmp_path, capsys):
     result = json.loads(capsys.readouterr().out)
     assert result["objects"][0]["bytes"] > 0
     assert run(["inspect", str(output), "--verify"]) == 0
+    assert "visibility of bar by 2 lobes" in capsys.readouterr().out
     assert run(["fit-pose", str(transfer), "-o", str(output), "--lobes", "1"]) == 3
     assert run(["fit-pose", str(transfer), "-o", str(output), "--lobes", "7"]) == 2
 
