@@ -1,7 +1,7 @@
 """What accuracy costs: error, time and bytes of every way to keep direct transfer, on one scene.
 
 Every row is a store that `precompute` made. Errors are relative RMS of the exit radiance over sampled receivers,
-against R = 256 with every texel traced.
+against R = 256 with every texel traced and suns in finer parts.
 """
 
 from __future__ import annotations
@@ -10,15 +10,15 @@ import shutil
 import statistics
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.processes import cores, meet, run_tool, together
-from benchmarks.receivers import Traceable, read_traceable, sample, share
+from benchmarks.processes import cores, run_tool, together
+from benchmarks.receivers import read_traceable, sample
 from benchmarks.report import Report, Table
 from benchmarks.scenes import Setting, two_skies, write_scene
+from benchmarks.truth import Sky, truth
 
 VARIANTS = (
     *(("visibility", f"R = {r}", "visibility/bits", ("--light-resolution", str(r))) for r in (16, 32, 64, 128)),
@@ -32,24 +32,6 @@ VARIANTS = (
 QUICK = (0, 4, 7, 10)  # one of each basis
 EPSILONS = (0.16, 0.08, 0.0425)  # of clustered lights, from a store of R = 64
 REPEATS = 3
-Sky = NDArray[np.float32]
-
-
-def truth(rank: int, count: int, points: Traceable, resolution: int, skies: list[Sky]) -> list[tuple[slice, Any]]:
-    """Irradiance (skies, n, 3) of this process's share of the receivers, every texel traced."""
-    from relightcli.core.lights.environment import latlong_to_cube, splat
-    from relightcli.core.shade.irradiance import irradiance, moment_prefix
-    from relightcli.core.transport.visibility import trace_visibility
-
-    tracer = points.tracer()
-    prefix = [moment_prefix(splat(latlong_to_cube(sky, resolution))) for sky in skies]
-    meet()
-    out = []
-    for part in share(len(points.position), rank, count, 64):
-        normal = points.normal[part]
-        bits = trace_visibility(tracer, points.position[part], normal, resolution, 1, 0).bits
-        out.append((part, np.stack([irradiance(bits, normal, p) for p in prefix])))
-    return out
 
 
 def light(store: Path, skies: list[Sky]) -> tuple[list[NDArray[np.float32]], float]:
@@ -91,7 +73,7 @@ def measure(setting: Setting) -> Report:
     rows = np.zeros(0, np.intp)
     count = 0
     for basis, knob, arrays, options in [VARIANTS[k] for k in QUICK] if setting.quick else VARIANTS:
-        finished, _ = run_tool("precompute", scene, "-o", store, *options, *setting.options)
+        finished, _ = run_tool("precompute", scene, "-o", store, "--bounces", "0", *options, *setting.options)
         opened = formats.open_store(store)
         if expected is None:
             points = read_traceable(store)
@@ -110,7 +92,7 @@ def measure(setting: Setting) -> Report:
         table.append((basis, knob, *errors, 1e3 * seconds, stored / count, finished.seconds))
         shutil.rmtree(store)
     assert expected is not None
-    made, _ = run_tool("precompute", scene, "-o", store, *setting.options)
+    made, _ = run_tool("precompute", scene, "-o", store, "--bounces", "0", *setting.options)
     for epsilon in EPSILONS[:1] if setting.quick else EPSILONS:
         clusters = setting.work / "clusters.zarr"
         finished, told = run_tool(

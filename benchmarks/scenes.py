@@ -128,7 +128,7 @@ def main_store(setting: Setting) -> Path:
     """The store of the main scene with default settings; made if need be."""
     if not setting.store.exists():
         scene, _ = write_scene(setting)
-        run_tool("precompute", scene, "-o", setting.store, *setting.options)
+        run_tool("precompute", scene, "-o", setting.store, "--bounces", "0", *setting.options)
     return setting.store
 
 

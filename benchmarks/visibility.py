@@ -87,9 +87,13 @@ def measure(setting: Setting) -> Report:
     report = Report(f"{subject}, R = {RESOLUTION}, default settings")
     tiny = Setting(setting.work, True)
     small, _ = write_scene(tiny, 300)
-    run_tool("precompute", small, "-o", setting.work / "warm.zarr", *tiny.options)  # compiled code onto disk
+    run_tool(
+        "precompute", small, "-o", setting.work / "warm.zarr", "--bounces", "0", *tiny.options
+    )  # compiled code onto disk
 
-    finished, said = run_tool("precompute", scene, "-o", setting.store, "--overwrite", *setting.options)
+    finished, said = run_tool(
+        "precompute", scene, "-o", setting.store, "--overwrite", "--bounces", "0", *setting.options
+    )
     report.about += f", {said['receivers']:,} receivers"
     report.rows += [
         at_most("precompute, start of the program to its end", finished.seconds, "s", 30),
@@ -116,6 +120,8 @@ def measure(setting: Setting) -> Report:
             scene,
             "-o",
             setting.work / "cold.zarr",
+            "--bounces",
+            "0",
             env={"NUMBA_CACHE_DIR": str(setting.work / "numba")},
         )
         report.rows.append(Row("precompute, first run after installing (compiles)", cold.seconds, "s"))

@@ -11,12 +11,13 @@ import relightcli
 
 PACKAGE = Path(relightcli.__file__).parent
 
-# What each room may import of the project. `core` knows the plain records of `scene.model` and nothing else of `scene`;
-# `errors` is the only module that all may import, and the only one below `stages` that knows the store format.
+# What each room may import of the project. `core` and `plan` know the plain records of `scene.model` and nothing else
+# of `scene`; `errors` is the only module that all may import, and the only one below `stages` that knows the store
+# format.
 ALLOWED = {
     "cli": {"cli", "stages", "errors", "__version__"},
     "stages": {"stages", "plan", "run", "scene", "adapters", "core", "errors", "relight_formats", "__version__"},
-    "plan": {"plan", "core", "errors"},
+    "plan": {"plan", "core", "scene.model", "errors"},
     "run": {"run", "errors"},
     "scene": {"scene", "adapters", "core", "errors"},
     "adapters": {"adapters", "core", "errors"},
@@ -61,13 +62,13 @@ def room_of(path):
 
 
 def target(module, room):
-    """Room (or scene.model, seen from core) that a module of the project belongs to, or None for other libraries."""
+    """Room (or scene.model, seen from core and plan) that a module of the project belongs to; None for others."""
     parts = module.split(".")
     if parts[0] == "relight_formats":
         return "relight_formats"
     if parts[0] != "relightcli":
         return None
-    if room == "core" and parts[1:3] == ["scene", "model"]:
+    if room in ("core", "plan") and parts[1:3] == ["scene", "model"]:
         return "scene.model"
     return parts[1] if len(parts) > 1 else "__init__"
 

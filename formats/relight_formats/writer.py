@@ -62,6 +62,26 @@ class Writer:
                     self._layouts[name] = read_layout(document, f"{partial}: array {name}")
 
     @property
+    def settings(self) -> dict[str, Any]:
+        """As given to `begin`."""
+        settings: dict[str, Any] = self._header["settings"]
+        return settings
+
+    @property
+    def attrs(self) -> dict[str, Any]:
+        """As given to `set_attrs`."""
+        return self._attributes
+
+    @property
+    def layouts(self) -> dict[str, Layout]:
+        """Shape, chunks, data type and dimension names per array so far."""
+        return dict(self._layouts)
+
+    def read(self, name: str) -> "np.ndarray[Any, Any]":
+        """A whole array so far, in memory. Raises StoreError if there is none."""
+        return np.asarray(worker_array(self.partial_path, name)[...])
+
+    @property
     def done(self) -> frozenset[str]:
         """Ids of the blocks whose results are on disk."""
         return frozenset(block["id"] for block in self._ledger.blocks)

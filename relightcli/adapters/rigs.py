@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from relightcli.adapters.gltf_skin import read_skinned
 from relightcli.adapters.meshes import LoadedMesh, finish_mesh, read_file
 from relightcli.core.pose.rig import Rig, any_tangents, joint_matrices
-from relightcli.errors import InputError
+from relightcli.errors import InputError, RelightError
 
 SUFFIXES = (".gltf", ".glb")
 
@@ -28,7 +28,11 @@ def load_rig(path: Path) -> tuple[LoadedMesh, Rig]:
         raise InputError(f'{path}: expected {" or ".join(SUFFIXES)} for motion = "skinned", found {suffix!r}.')
     try:
         found = read_skinned(path, data)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:  # a header of another shape than expected
+    except RelightError:
+        raise
+    except MemoryError:
+        raise InputError(f"{path}: does not fit in memory.") from None
+    except Exception as error:  # whatever a header of another shape than expected leads to
         raise InputError(f"{path}: cannot be read as a skinned {suffix[1:].upper()} ({error!r:.200}).") from error
     try:
         mesh = finish_mesh([skinned.part for skinned in found.parts], list(found.notes))

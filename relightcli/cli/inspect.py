@@ -61,6 +61,11 @@ def _text(result: dict[str, Any]) -> str:
             line += f", {cost['rays'] / 1e6:.1f} million rays"
         line += f", peak {size(cost['peak_bytes'])}"
         lines.append(line)
+        if "relative_error" in cost:
+            lines.append(
+                f"  error     {effect}: {cost['relative_error']:.2%} of what vertices see, from "
+                f"{int(cost['vertices_checked'])} checks"
+            )
         if "wrong_bits" in cost:
             lines.append(
                 f"  error     {effect}: {cost['wrong_bits']:.1e} of bits wrong, from {int(cost['checked'])} checks"

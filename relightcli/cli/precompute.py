@@ -20,7 +20,10 @@ from relightcli.cli import options
     help="auto, all, or names: direct,shadows,one-bounce,two-bounce,specular,pose.",
 )
 @click.option(
-    "--light-resolution", default=64, show_default=True, help="Texels along a face of the sky cube: 16 to 256."
+    "--light-resolution",
+    default=None,
+    type=int,
+    help="Texels along a face of the sky cube: 16 to 256. Default: 64, or what --tolerance takes.",
 )
 @click.option(
     "--refine", default=4, show_default=True, help="Visibility is probed every N texels and refined; 1 traces them all."
@@ -41,10 +44,17 @@ from relightcli.cli import options
     "--tolerance",
     default=None,
     type=float,
-    help="Haar: keep only as many coefficients as leave this relative RMS of a receiver's transfer out.",
+    help="Relative RMS error of radiance to keep: settings are chosen for it, and it is measured at the end. With "
+    "--basis haar: of a receiver's transfer, that coefficients left out may cost.",
 )
+@click.option("--allow-miss", is_flag=True, help="Keep the store where its error is larger than --tolerance.")
 @click.option("--sh-order", default=6, show_default=True, help="Bands of the spherical harmonics.")
-@click.option("--bounces", default=None, type=int, help="Interreflections. Default: what --effects names, 0 with auto.")
+@click.option(
+    "--bounces",
+    default=None,
+    type=int,
+    help="Interreflections. Default: what --effects names; auto: as many as the scene calls for.",
+)
 @click.option(
     "--bounce-resolution",
     default=None,
@@ -90,10 +100,10 @@ def command(
 def _text(result: dict[str, Any]) -> str:
     lines = [f"note: {note}" for note in result["notes"]]
     if result.get("dry_run"):
-        lines += [
-            f"{'simulate' if row['simulate'] else 'skip':9}{row['effect']:12}{row['evidence']}"
-            for row in result["plan"]
-        ]
+        for row in result["plan"]:
+            cost = row.get("predicted")
+            costs = f"{cost['seconds']:.1f} s, {options.bytes_text(cost['bytes'])}" if cost else ""
+            lines.append(f"{'simulate' if row['simulate'] else 'skip':9}{row['effect']:12}{costs:18}{row['evidence']}")
         cost = result["predicted"]
         lines.append(
             f"{result['receivers']} receivers; predicted {cost['rays'] / 1e6:.1f} million rays, "

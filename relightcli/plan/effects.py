@@ -1,31 +1,47 @@
 """Which effects a scene calls for, with the evidence.
 
 Names follow interface.md: direct, shadows, one-bounce, two-bounce, specular, fields, pose. This version does not
-simulate fields; a scene or a user that needs them is told so. Interreflections are simulated when they are asked
-for, by name or by number. Specular lobes cost nothing here: they are integrated when a picture is made.
+simulate fields; a scene or a user that needs them is told so. Left to itself (`auto`) the plan asks structure
+first (nothing can block anything), then a pilot (`plan.pilot`): an effect is skipped where leaving it out costs less
+than SKIPPED of the tolerance. Specular lobes cost nothing here: they are integrated when a picture is made.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from relightcli.errors import InputError
+from relightcli.plan.pilot import Share
 
 KNOWN = ("direct", "shadows", "one-bounce", "two-bounce", "specular", "fields", "pose")
 AVAILABLE = ("direct", "shadows", "one-bounce", "two-bounce", "specular", "pose")
 BOUNCES = {"one-bounce": 1, "two-bounce": 2}
+SKIPPED = 0.5  # of the tolerance: what effects that are left out may cost together
+COARSE_ERROR = 0.06  # of interreflections through cells of 11 degrees, where those of 2.8 degrees are taken for true
+MOST_PLANNED = 8  # interreflections, unless more are asked for
 
 
 @dataclass(frozen=True)
 class Decision:
-    """One row of the plan: what is done about an effect, and why."""
+    """One row of the plan: what is done about an effect, and why; share and bound: of the light, if measured."""
 
     effect: str
     simulate: bool
     evidence: str
+    share: float | None = None
+    bound: float | None = None
+
+
+class Pilot(Protocol):
+    """Measurements that the plan asks for where structure decides nothing."""
+
+    def tails(self, allowed: float) -> list[Share]: ...
+    def shadows(self) -> Share: ...
 
 
 def parse_effects(text: str) -> tuple[str, ...] | None:
@@ -51,11 +67,14 @@ def parse_effects(text: str) -> tuple[str, ...] | None:
     return names
 
 
-def bounces_asked(asked: tuple[str, ...] | None, bounces: int | None) -> int:
-    """Interreflections to simulate: `--bounces`, or what `--effects` names. Raises InputError if they contradict."""
+def bounces_asked(asked: tuple[str, ...] | None, bounces: int | None) -> int | None:
+    """Interreflections to simulate: `--bounces`, or what `--effects` names; None where the plan decides.
+
+    Raises InputError if the two contradict.
+    """
     named = max((BOUNCES.get(name, 0) for name in asked or ()), default=0)
     if bounces is None:
-        return named
+        return None if asked is None else named
     if asked not in (None, AVAILABLE) and min(bounces, 2) != named:
         raise InputError(
             f"--bounces {bounces}: --effects names {named or 'no'} bounces; expected the same (one-bounce, "
@@ -85,23 +104,75 @@ def decide(
     faces: NDArray[np.int32],
     both_sides: bool,
     lobes: bool,
-    bounces: int,
-) -> list[Decision]:
-    """The plan for a static scene: `direct` always, `shadows` unless nothing can block anything, `bounces` with it.
+    bounces: int | None,
+    tolerance: float,
+    pilot: Callable[[], Pilot],
+) -> tuple[list[Decision], int]:
+    """The plan for a static scene, and how many interreflections it has.
 
-    both_sides: any object is lit from both; lobes: any material has a specular lobe, or may get one.
+    both_sides: any object is lit from both; lobes: any material has a specular lobe, or may get one; bounces: None
+    leaves their number to the plan; tolerance: relative RMS; pilot: makes the measurements, called only if needed.
     """
     shadows = _shadows(asked, positions, faces, both_sides)
-    plan = [Decision("direct", True, "always"), shadows]
-    for name, number in BOUNCES.items():
-        if bounces < number:
-            plan.append(Decision(name, False, "not asked for"))
-        elif not shadows.simulate:
-            plan.append(Decision(name, False, "no light can go from one point of the scene to another"))
-        else:
-            plan.append(Decision(name, True, f"asked for: {bounces} interreflections"))
+    allowed = SKIPPED * tolerance
+    rows = [Decision(name, False, "not asked for") for name in BOUNCES]
+    if not shadows.simulate:
+        if bounces != 0:
+            rows = [Decision(name, False, "no light can go from one point of the scene to another") for name in BOUNCES]
+        bounces = bounces or 0
+    elif bounces is not None:
+        for k, (name, number) in enumerate(BOUNCES.items()):
+            if bounces >= number:
+                rows[k] = Decision(name, True, f"asked for: {bounces} interreflections")
+    elif asked is None:
+        measure = pilot()
+        tails = measure.tails(allowed)
+        bounces = bounces_needed(tails, allowed)
+        rows = [_bounce(name, number, tails, bounces, allowed) for name, number in BOUNCES.items()]
+        if bounces == 0 and not both_sides:
+            lost = measure.shadows()
+            shadows = Decision("shadows", lost.bound > allowed, _text(lost, allowed), lost.share, lost.bound)
+    assert bounces is not None
     evidence = "integrated from visibility when a picture is made" if lobes else "no material has a specular lobe"
-    return [*plan, Decision("specular", lobes, evidence)]
+    return [Decision("direct", True, "always"), shadows, *rows, Decision("specular", lobes, evidence)], bounces
+
+
+def bounces_needed(tails: Sequence[Share], allowed: float) -> int:
+    """The least number of interreflections after which no more than `allowed` is missing, at most MOST_PLANNED.
+
+    tails: what is missing after k, k = 0 ... Beyond the last one the tail is taken to fall as it did there.
+    """
+    for k, tail in enumerate(tails):
+        if tail.bound <= allowed:
+            return k
+    bound, number = tails[-1].bound, len(tails) - 1
+    ratio = min(bound / tails[-2].bound, 0.95)
+    while bound > allowed and number < MOST_PLANNED:
+        bound, number = bound * ratio, number + 1
+    return number
+
+
+def bounce_cells(plan: Sequence[Decision], tolerance: float) -> int:
+    """Cells along a face through which light bounces, where the plan has measured how much of it there is: 8 where
+    matte light from there is off by SKIPPED of the tolerance at most, else 16."""
+    rows = {row.effect: row for row in plan}
+    bound = rows["one-bounce"].bound
+    coarse = bound is not None and bound * COARSE_ERROR <= SKIPPED * tolerance and not rows["specular"].simulate
+    return 8 if coarse else 16
+
+
+def _bounce(name: str, number: int, tails: Sequence[Share], bounces: int, allowed: float) -> Decision:
+    tail = tails[number - 1]
+    evidence = _text(tail, allowed)
+    if number == max(BOUNCES.values()) and bounces > number:
+        evidence += f"; {bounces} interreflections are simulated"
+        if bounces < len(tails):
+            evidence += f", the rest carries at most {tails[bounces].bound:.2%}"
+    return Decision(name, bounces >= number, evidence, tail.share, tail.bound)
+
+
+def _text(share: Share, allowed: float) -> str:
+    return f"at most {share.bound:.2%} of the light ({share.where}); {allowed:.2%} may be left out"
 
 
 def decide_pose(asked: tuple[str, ...] | None, clips: dict[str, int]) -> Decision:

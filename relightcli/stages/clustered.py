@@ -28,7 +28,7 @@ from relightcli.scene.model import Material
 from relightcli.stages.lighting import LightingStore, Radiance, _Coats
 
 PARTLY = 0.25  # of the clusters: if more have changed, all are summed again
-KEPT = 64  # points whose visibility is kept
+KEPT = 256  # points whose visibility is kept
 
 
 class ClusteredStore(LightingStore):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,9 @@ SUMMED = (
     "wrong",
     "inferred",
     "bits",
+    "vertices_checked",
+    "squared_error",
+    "squared_norm",
 )
 
 
@@ -91,4 +95,6 @@ def _cost(blocks: list[dict[str, Any]]) -> dict[str, Any]:
     for effect in cost.values():
         if effect.get("checked"):
             effect["wrong_bits"] = effect["wrong"] / effect["checked"] * effect["inferred"] / effect["bits"]
+        if effect.get("squared_norm"):
+            effect["relative_error"] = math.sqrt(effect["squared_error"] / effect["squared_norm"])
     return cost

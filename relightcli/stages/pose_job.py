@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import relight_formats as formats
 from relightcli.adapters.rays import Tracer
@@ -23,10 +24,13 @@ from relightcli.scene.model import Geometry, Scene
 from relightcli.stages.receiver_setup import hidden
 from relightcli.stages.rig_store import pose_group
 
+F64 = NDArray[np.float64]
 CHUNK_BYTES = 4_000_000
 MOST_FRAMES_PER_BLOCK = 4
 MOST_ORDER = 8
 MOST_DIRECTIONS = 1 << 16
+CHECKED = 16  # vertices of a block's first frame that are traced again, ...
+FINER = 8  # with so many times the directions
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,7 @@ class PoseWorker:
 
     def run(self, block: run.Block) -> run.Info:
         found, rays = [], 0
+        info: run.Info = {}
         for matrices in self.matrices[block.start : block.stop]:
             position, normal, tangent = blend(*self.skin, matrices)  # type: ignore[call-arg]
             self.positions[self.rows] = position
@@ -70,8 +75,23 @@ class PoseWorker:
             visibility, more = trace_visibility(tracer, position, normal, tangent, self.directions, self.job.order)
             found.append(visibility)
             rays += more
+            if not info:
+                info, more = _error(self.job, tracer, position, normal, tangent, visibility)
+                rays += more
         self.out[block.start : block.stop] = np.stack(found)
-        return {"rays": float(rays), "frames": float(len(found))}
+        return {**info, "rays": float(rays), "frames": float(len(found))}
+
+
+def _error(
+    job: PoseJob, tracer: Tracer, position: F64, normal: F64, tangent: F64, visibility: NDArray[np.float32]
+) -> tuple[run.Info, int]:
+    """Squared error of some vertices' coefficients against finer ones, the squares of these, and the rays."""
+    some = np.unique(np.linspace(0, len(position) - 1, CHECKED).astype(np.int64))
+    directions = hemisphere_directions(FINER * job.directions)
+    finer, rays = trace_visibility(tracer, position[some], normal[some], tangent[some], directions, job.order)
+    off = float(((visibility[some] - finer).astype(np.float64) ** 2).sum())
+    size = float((finer.astype(np.float64) ** 2).sum())
+    return {"vertices_checked": float(len(some)), "squared_error": off, "squared_norm": size}, rays
 
 
 def check_pose_options(frames: str, order: int, directions: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import zlib
 from dataclasses import dataclass, replace
@@ -18,15 +19,17 @@ from relightcli.adapters.rays import Tracer
 from relightcli.core.transport import visibility
 from relightcli.core.transport.hits import trace_hits
 from relightcli.core.transport.receivers import Receivers
+from relightcli.core.transport.shading import shading_scene
 from relightcli.core.transport.tessellation import tessellate
 from relightcli.errors import InputError
-from relightcli.plan import effects
+from relightcli.plan import effects, pilot
 from relightcli.run import blocks as run
 from relightcli.scene.build import build_geometry, scene_to_json
 from relightcli.scene.model import Geometry, Scene
 from relightcli.scene.parse import load_scene
 from relightcli.stages.inputs import scene_inputs
 from relightcli.stages.pose_job import check_pose_options, choose_frames, simulate_poses
+from relightcli.stages.promise import keep_promise, try_resolutions
 from relightcli.stages.receiver_setup import (
     MOST_PIXEL_GRID,
     PixelReceivers,
@@ -45,6 +48,7 @@ from relightcli.stages.visibility_job import VisibilityJob, block_size, create_o
 
 KIND = "transfer"
 BASES = ("visibility", "haar", "sh", "dense")
+RESOLUTION = 64  # texels along a face of the light's cube, unless asked for or chosen
 PILOT_GROUPS = 24  # groups of receivers that a dry run traces
 MOST_BOUNCES = 64
 BOUNCE_RESOLUTIONS = (8, 16, 32)
@@ -57,7 +61,7 @@ class Config:
 
     scene: Path
     output: Path
-    light_resolution: int = 64
+    light_resolution: int | None = None  # 64, or what `tolerance` takes
     refine: int = 4
     effects: str = "auto"
     receivers: str = "vertices"
@@ -66,6 +70,7 @@ class Config:
     basis: str = "visibility"
     coefficients: int = 128
     tolerance: float | None = None
+    allow_miss: bool = False
     sh_order: int = 6
     bounces: int | None = None
     bounce_resolution: int | None = None
@@ -87,7 +92,8 @@ def precompute(config: Config) -> dict[str, Any]:
     _check(config)
     need_output(config.output)
     asked = effects.parse_effects(config.effects)
-    bounces = effects.bounces_asked(asked, config.bounces)
+    wanted = effects.bounces_asked(asked, config.bounces)
+    promise = config.tolerance if config.basis == "visibility" else None
     scene = load_scene(config.scene, allow_outside=config.allow_outside)
     try:
         effects.need_static({o.name: o.motion for o in scene.objects.values()}, asked)
@@ -96,23 +102,51 @@ def precompute(config: Config) -> dict[str, Any]:
     geometry = build_geometry(scene)
     both = _both_sides(scene, geometry)
     check_receivers(config.receivers, scene, geometry)
+    if wanted:
+        _check_bounces(config)
+    clock = time.perf_counter()
+    plan, bounces = effects.decide(
+        asked,
+        geometry.positions,
+        geometry.faces,
+        bool(both.any()),
+        _lobes(scene),
+        wanted,
+        scene.tolerance if promise is None else promise,
+        lambda: _Pilot(scene, geometry),
+    )
+    planning = time.perf_counter() - clock
     if bounces:
         _check_bounces(config)
-    plan = effects.decide(asked, geometry.positions, geometry.faces, bool(both.any()), _lobes(scene), bounces)
     plan.append(effects.decide_pose(asked, {name: len(rig.clips) for name, rig in geometry.rigs.items()}))
     simulated = [d.effect for d in plan if d.simulate]
+    if promise is not None and "pose" in simulated:
+        raise InputError(
+            f"--tolerance: {scene.path} has skinned objects, and no error is promised for the light about what moves; "
+            "leave it out, or name effects without pose"
+        )
     shadows = "shadows" in simulated
     bounce_cells = 0
     if "one-bounce" in simulated:
-        bounce_cells = config.bounce_resolution or (8 if config.light_resolution % 16 else 16)
+        coarse = (config.light_resolution or RESOLUTION) % 16
+        planned = 8 if coarse else effects.bounce_cells(plan, promise or scene.tolerance)
+        bounce_cells = config.bounce_resolution or planned
     source = geometry
     if shadows and config.subdivide and (config.receivers == "vertices" or bounce_cells):
         geometry = _subdivided(geometry)
+    tried: list[tuple[int, pilot.Share]] = []
+    resolution = config.light_resolution or RESOLUTION
+    if config.light_resolution is None and promise is not None and shadows:
+        receivers, buried = _receivers(config, scene, source, geometry, both, plan, bool(bounce_cells))
+        tried = try_resolutions(config, scene, source, geometry, receivers, buried, promise)
+        resolution = tried[-1][0]
     if config.dry_run:
-        return _dry_run(config, scene, source, geometry, both, plan, shadows, bounce_cells)
-    settings = {
+        return _dry_run(
+            config, resolution, scene, source, geometry, both, plan, bounces, planning, shadows, bounce_cells
+        )
+    settings: dict[str, Any] = {
         "effects": simulated,
-        "light_resolution": config.light_resolution,
+        "light_resolution": resolution,
         "refine": config.refine if shadows else 1,
         "receivers": config.receivers,
         "subdivide": config.subdivide,
@@ -152,7 +186,9 @@ def precompute(config: Config) -> dict[str, Any]:
         writer.set_attrs(
             {
                 "scene": scene_to_json(scene, geometry),
-                "plan": [{"effect": d.effect, "simulate": d.simulate, "evidence": d.evidence} for d in plan],
+                "plan": [_row(d) for d in plan],
+                "planning_seconds": planning,
+                "tried": [{"light_resolution": r, "share": e.share, "where": e.where} for r, e in tried],
                 "nothing_blocks": asked is None and not shadows,
             }
         )
@@ -165,7 +201,7 @@ def precompute(config: Config) -> dict[str, Any]:
             put_vertex_colours(writer, geometry)
         job = VisibilityJob(
             str(writer.partial_path),
-            config.light_resolution,
+            resolution,
             config.refine,
             shadows,
             config.basis,
@@ -181,7 +217,7 @@ def precompute(config: Config) -> dict[str, Any]:
         create_outputs(writer, job, len(receivers))
         run.run_blocks(
             job,
-            run.split("visibility", len(receivers), block_size(config.light_resolution)),
+            run.split("visibility", len(receivers), block_size(resolution)),
             writer,
             workers=config.workers,
             label="visibility",
@@ -200,12 +236,36 @@ def precompute(config: Config) -> dict[str, Any]:
                 config.workers,
                 config.quiet,
             )
+        if promise is not None:
+            keep_promise(config, promise, resolution, scene, source, geometry, receivers, buried, writer)
         writer.commit({"seconds": time.perf_counter() - started, "resumed": resumed, "workers": config.workers})
     return _summary(config, started, resumed, geometry)
 
 
+class _Pilot:
+    """See `plan.effects.Pilot`."""
+
+    def __init__(self, scene: Scene, geometry: Geometry) -> None:
+        self.scene = shading_scene(geometry, pilot.brightest(scene.materials.values()), scene.lights.values())
+        self.tracer = Tracer(geometry.positions, geometry.faces)
+        self.views = pilot.views(list(scene.cameras.values()), geometry.positions, geometry.faces)
+
+    def tails(self, allowed: float) -> list[pilot.Share]:
+        return pilot.tails(self.scene, self.tracer, self.views, allowed)
+
+    def shadows(self) -> pilot.Share:
+        return pilot.shadows(self.scene, self.tracer, self.views)
+
+
+def _row(decision: effects.Decision) -> dict[str, Any]:
+    """A row of the plan as it is stored; what was not measured is left out."""
+    row = {"effect": decision.effect, "simulate": decision.simulate, "evidence": decision.evidence}
+    measured = {"share": decision.share, "bound": decision.bound}
+    return row | {key: value for key, value in measured.items() if value is not None and math.isfinite(value)}
+
+
 def _check(config: Config) -> None:
-    resolution = config.light_resolution
+    resolution = config.light_resolution or RESOLUTION
     if not 16 <= resolution <= 256 or resolution % 8:
         raise InputError(f"--light-resolution: expected a multiple of 8 from 16 to 256; found {resolution}")
     if config.basis == "haar" and resolution & (resolution - 1):
@@ -232,11 +292,11 @@ def _check(config: Config) -> None:
 
 
 def _check_bounces(config: Config) -> None:
-    cells = config.bounce_resolution
-    if cells is not None and (cells not in BOUNCE_RESOLUTIONS or config.light_resolution % cells):
+    cells, resolution = config.bounce_resolution, config.light_resolution or RESOLUTION
+    if cells is not None and (cells not in BOUNCE_RESOLUTIONS or resolution % cells):
         raise InputError(
             "--bounce-resolution: expected 8, 16 or 32, and a divisor of --light-resolution "
-            f"({config.light_resolution}); found {cells}"
+            f"({resolution}); found {cells}"
         )
 
 
@@ -332,13 +392,25 @@ def _raw_bytes(geometry: Geometry, points: Receivers) -> int:
     return sum(a.nbytes for a in [*arrays, *geometry.textures.values()])
 
 
+def _pose_cost(config: Config, geometry: Geometry, traced: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rays, seconds and bytes of the frames of skinned objects, at the speed of the rays of `traced`."""
+    rigs = [rig for rig in geometry.rigs.values() if rig.clips]
+    samples = sum(len(choose_frames(rig, config.pose_frames)) * len(rig.position) for rig in rigs)
+    rays = samples * config.pose_directions
+    seconds = rays * traced[1] / traced[0] if traced[0] else 0.0
+    return np.array([rays, seconds, 4.0 * samples * config.pose_order**2])
+
+
 def _dry_run(
     config: Config,
+    resolution: int,
     scene: Scene,
     source: Geometry,
     geometry: Geometry,
     both: NDArray[np.bool_],
     plan: list[effects.Decision],
+    bounces: int,
+    planning: float,
     shadows: bool,
     bounce_cells: int,
 ) -> dict[str, Any]:
@@ -348,50 +420,49 @@ def _dry_run(
     """
     receivers, _ = _receivers(config, scene, source, geometry, both, plan, bool(bounce_cells))
     points = receivers.points if isinstance(receivers, PixelReceivers) else receivers
-    rays = seconds = packed = 0.0
+    spent = {"shadows": np.zeros(3), "one-bounce": np.zeros(3)}  # rays, seconds, bytes
     if shadows and len(points):
         tracer = Tracer(geometry.positions, geometry.faces)
         surfaces = surfaces_of(geometry, points, np.zeros(len(points), bool)) if bounce_cells else None
         starts = np.linspace(0, max(0, len(points) - visibility.GROUP), PILOT_GROUPS + 1).astype(int)
-        pilot = 0
+        pilot_receivers = 0
         for k, start in enumerate(starts):
             rows = slice(start, start + visibility.GROUP)
             clock = time.perf_counter()
             block = visibility.trace_visibility(
-                tracer, points.position[rows], points.normal[rows], config.light_resolution, config.refine, config.seed
+                tracer, points.position[rows], points.normal[rows], resolution, config.refine, config.seed
             )
+            seen = time.perf_counter()
+            hits = None
             if surfaces is not None:
                 hits, more = trace_hits(
                     tracer, surfaces, points.position[rows], points.normal[rows], block.bits, bounce_cells, start, 0
                 )
+            end = time.perf_counter()
             if k:  # the first run pays for compilation
-                seconds += time.perf_counter() - clock
-                rays += block.rays
-                pilot += len(block.bits)
-                packed += len(zlib.compress(block.bits.tobytes(), 1))
-                if surfaces is not None:
-                    rays += more
-                    packed += len(zlib.compress(hits.tobytes(), 1))
-        rays *= len(points) / pilot
-        packed *= len(points) / pilot
-        seconds *= len(points) / pilot
+                pilot_receivers += len(block.bits)
+                spent["shadows"] += block.rays, seen - clock, len(zlib.compress(block.bits.tobytes(), 1))
+                if hits is not None:
+                    spent["one-bounce"] += more, end - seen, len(zlib.compress(hits.tobytes(), 1))
+        for cost in spent.values():
+            cost *= len(points) / pilot_receivers
+            cost[1] /= max(1, config.workers)
     if any(d.effect == "pose" and d.simulate for d in plan):
-        coefficients = config.pose_order**2
-        samples = sum(
-            len(choose_frames(rig, config.pose_frames)) * len(rig.position)
-            for rig in geometry.rigs.values()
-            if rig.clips
-        )
-        if rays:
-            seconds *= 1.0 + samples * config.pose_directions / rays
-        rays += samples * config.pose_directions
-        packed += 4 * samples * coefficients
-    seconds /= max(1, config.workers)
+        spent["pose"] = _pose_cost(config, geometry, spent["shadows"])
+    rays, seconds, packed = np.sum(list(spent.values()), axis=0)
+    rows_of_plan = [_row(d) for d in plan]
+    for row in rows_of_plan:
+        if row["simulate"] and row["effect"] in spent:
+            cost = spent[row["effect"]]
+            row["predicted"] = {"rays": int(cost[0]), "seconds": float(cost[1]), "bytes": int(cost[2])}
     return {
         "dry_run": True,
         "store": str(config.output),
         "receivers": len(points),
-        "plan": [{"effect": d.effect, "simulate": d.simulate, "evidence": d.evidence} for d in plan],
+        "bounces": bounces,
+        "light_resolution": resolution,
+        "plan": rows_of_plan,
+        "planning_seconds": planning,
         "predicted": {"rays": int(rays), "seconds": seconds, "bytes": int(packed) + _raw_bytes(geometry, points)},
         "notes": list(geometry.notes),
     }

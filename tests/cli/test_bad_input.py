@@ -94,7 +94,7 @@ def test_meshes(here, refused, content, words):
         (("--refine", "8"), ("--refine", "found 8")),  # 16 texels are too few for it
         (("--effects", ""), ("--effects", "direct, shadows", "found ''")),
         (("--effects", "direct,magic"), ("--effects", "found 'magic'")),
-        (("--effects", "direct,pose"), ("--effects", "'pose' is not simulated by this version")),
+        (("--effects", "direct,fields"), ("--effects", "'fields' is not simulated by this version")),
         (("--effects", "direct,one-bounce"), ("--effects", "'one-bounce' needs 'shadows'")),
         (("--effects", "shadows"), ("--effects", "'direct' must be among them")),
         (("--receivers", "pixels"), ("--receivers", "pixels:CAMERA", "found 'pixels'")),
@@ -111,6 +111,9 @@ def test_meshes(here, refused, content, words):
         (("--bounces", "x"), ("--bounces", "'x' is not a valid integer")),
         (("--bounces", "1", "--effects", "direct,shadows"), ("--bounces 1", "--effects names no bounces")),
         (("--bounces", "1", "--bounce-resolution", "12"), ("--bounce-resolution", "8, 16 or 32", "found 12")),
+        (("--pose-frames", "spread"), ("--pose-frames", "spread:N", "found 'spread'")),
+        (("--pose-order", "0"), ("--pose-order", "1 to 8", "found 0")),
+        (("--pose-directions", "1"), ("--pose-directions", "16 to 65536", "found 1")),
         (("--workers", "0"), ("--workers", "0 is not in the range")),
         (("--workers", "100000"), ("--workers", "is not in the range")),
         (("--seed", "-1"), ("--seed", "-1 is not in the range")),

@@ -6,13 +6,17 @@ import pytest
 from relightcli.errors import InputError
 from relightcli.plan.effects import (
     AVAILABLE,
+    MOST_PLANNED,
     blocks_nothing,
+    bounce_cells,
     bounces_asked,
+    bounces_needed,
     decide,
     decide_pose,
     need_static,
     parse_effects,
 )
+from relightcli.plan.pilot import Share
 from tests.core.transport.scenes import sphere_grid
 
 BALL, BALL_FACES = (x[0].astype(x[1]) for x in zip(sphere_grid(12, 24), (np.float64, np.int32), strict=True))
@@ -100,13 +104,39 @@ def test_nothing_to_test():
     assert blocks_nothing(SQUARE, np.zeros((1, 3), np.int32)) is None
 
 
-def plan_of(asked, both=False, positions=BALL, faces=BALL_FACES, lobes=False, bounces=0):
-    plan = {d.effect: d for d in decide(asked, positions, faces, both, lobes, bounces)}
+class Measured:
+    """A pilot that has measured what the test says."""
+
+    def __init__(self, tails, shadows=1.0):
+        self.found, self.lost = [share(t) for t in tails], share(shadows)
+
+    def tails(self, allowed):
+        return self.found
+
+    def shadows(self):
+        return self.lost
+
+
+def share(bound):
+    return Share(0.8 * bound, bound, 0.6 * bound, "camera main, even light")
+
+
+def no_pilot():
+    raise AssertionError("structure decides; nothing need be measured")
+
+
+def plan_of(asked, both=False, positions=BALL, faces=BALL_FACES, lobes=False, bounces=0, tolerance=0.02, pilot=None):
+    make = no_pilot if pilot is None else lambda: pilot
+    rows, number = decide(asked, positions, faces, both, lobes, bounces, tolerance, make)
+    plan = {d.effect: d for d in rows}
     assert plan["direct"].simulate
+    if plan["shadows"].simulate:
+        assert [plan[name].simulate for name in ("one-bounce", "two-bounce")] == [number >= 1, number >= 2]
     return plan
 
 
 def shadows(*args, **kwargs):
+    kwargs.setdefault("bounces", 0)
     return plan_of(*args, **kwargs)["shadows"]
 
 
@@ -116,9 +146,12 @@ def test_bounces_are_simulated_when_asked_for_and_possible():
     for bounces, expected in ((0, [False, False]), (1, [True, False]), (2, [True, True]), (9, [True, True])):
         plan = plan_of(None, faces=bowl, bounces=bounces)
         assert [plan[name].simulate for name in names] == expected
-    convex = plan_of(None, bounces=2)
+    convex = plan_of(("direct",), bounces=0, faces=bowl)
     assert not any(convex[name].simulate for name in names)
-    assert "no light can go" in convex["one-bounce"].evidence
+    for asked in (2, None):
+        convex = plan_of(None, bounces=asked)
+        assert "no light can go" in convex["one-bounce"].evidence
+        assert not any(convex[name].simulate for name in names)
 
 
 def test_lobes_are_told():
@@ -129,7 +162,7 @@ def test_lobes_are_told():
 @pytest.mark.parametrize(
     ("effects", "bounces", "expected"),
     [
-        ("auto", None, 0),
+        ("auto", None, None),
         ("auto", 3, 3),
         ("all", None, 2),
         ("all", 5, 5),
@@ -162,3 +195,57 @@ def test_decisions_come_with_their_evidence():
     assert "both sides" in shadows(None, both=True).evidence
     assert shadows(("direct", "shadows")).simulate
     assert not shadows(("direct",), faces=BALL_FACES[:, ::-1]).simulate
+
+
+BOWL = BALL_FACES[:, ::-1]
+
+
+@pytest.mark.parametrize(
+    ("tails", "allowed", "expected"),
+    [
+        ((0.009, 0.001), 0.01, 0),
+        ((0.011, 0.001), 0.01, 1),
+        ((0.3, 0.1, 0.03, 0.01), 0.01, 3),
+        ((0.4, 0.2), 0.05, 3),  # halves from bounce to bounce
+        ((0.4, 0.4), 0.01, MOST_PLANNED),
+        ((np.inf, 0.001), 0.01, 1),
+        ((0.0, 0.0), 0.01, 0),
+    ],
+)
+def test_as_many_bounces_as_carry_more_than_may_be_left_out(tails, allowed, expected):
+    assert bounces_needed([share(t) for t in tails], allowed) == expected
+
+
+def test_half_the_tolerance_is_for_what_is_left_out():
+    for tolerance, expected in ((0.03, 1), (0.09, 0), (0.005, 3)):
+        plan = plan_of(None, faces=BOWL, bounces=None, tolerance=tolerance, pilot=Measured([0.04, 0.01, 0.003, 0.001]))
+        assert [plan["one-bounce"].simulate, plan["two-bounce"].simulate] == [expected >= 1, expected >= 2]
+        assert plan["one-bounce"].bound == 0.04
+        assert f"{0.5 * tolerance:.2%} may be left out" in plan["two-bounce"].evidence
+        assert "camera main, even light" in plan["one-bounce"].evidence
+    assert "3 interreflections are simulated, the rest carries at most 0.10%" in plan["two-bounce"].evidence
+
+
+def test_shadows_are_skipped_where_they_and_all_that_follows_are_too_small():
+    def plan(tail, lost, both=False):
+        return plan_of(None, both, faces=BOWL, bounces=None, pilot=Measured([tail, 0.0], lost))["shadows"]
+
+    assert not plan(0.009, 0.009).simulate
+    assert plan(0.009, 0.011).simulate
+    assert plan(0.011, 0.009).simulate  # light that bounces needs them
+    assert plan(0.009, 0.009, both=True).simulate
+    assert plan(0.009, 0.009).bound == 0.009
+
+
+def test_names_need_no_pilot():
+    assert not plan_of(("direct", "shadows"), faces=BOWL)["one-bounce"].simulate
+
+
+@pytest.mark.parametrize(
+    ("tail", "lobes", "expected"), [(0.1, False, 8), (0.3, False, 16), (0.1, True, 16), (None, False, 16)]
+)
+def test_cells_are_wide_where_little_light_bounces(tail, lobes, expected):
+    # 6 % of 10 % is less than half of 2 %; of 30 % it is not. Lobes would show the cells.
+    given = {"bounces": 1} if tail is None else {"bounces": None, "pilot": Measured([tail, 0.0])}
+    rows = plan_of(None, faces=BOWL, lobes=lobes, **given).values()
+    assert bounce_cells(list(rows), 0.02) == expected

@@ -71,8 +71,10 @@ def write_scene(folder, parts, cameras, maps, adjustable=False, more=""):
 
 
 def make_store(scene, name="transfer.zarr", **settings):
-    """Precomputes next to the scene file; returns the store's path."""
+    """Precomputes next to the scene file, without bounces unless told; returns the store's path."""
     output = scene.parent / name
+    if "effects" not in settings:
+        settings.setdefault("bounces", 0)
     precompute(PrecomputeConfig(scene=scene, output=output, quiet=True, **{"workers": 1, **settings}))
     return output
 

@@ -35,7 +35,13 @@ def scene(tmp_path_factory):
 
 
 def config(scene, output, **settings):
-    defaults = {"light_resolution": 16, "refine": 2, "workers": 1, "quiet": True}
+    defaults = {
+        "light_resolution": 16,
+        "refine": 2,
+        "workers": 1,
+        "quiet": True,
+        "bounces": None if "effects" in settings else 0,
+    }
     return Config(scene=scene, output=output, **{**defaults, **settings})
 
 
@@ -169,6 +175,29 @@ def test_dry_run_writes_nothing(scene, tmp_path):
     assert made["receivers"] == result["receivers"]
     # Rays predicted from a pilot at five places.
     assert result["predicted"]["rays"] == pytest.approx(made["rays"], rel=0.3)
+
+
+def test_left_to_itself_it_simulates_the_interreflections_that_count(scene, tmp_path):
+    plan = precompute(config(scene, tmp_path / "t.zarr", effects="auto", dry_run=True))
+    precompute(config(scene, tmp_path / "t.zarr", effects="auto"))
+    store = formats.open_store(tmp_path / "t.zarr", "transfer")
+    assert store.settings["bounces"] == plan["bounces"] >= 1
+    assert store.settings["bounce_resolution"] == 8  # matte, and a tenth of the light bounces
+    stored, told = ({row["effect"]: row for row in rows} for rows in (store.attrs["plan"], plan["plan"]))
+    assert 0.03 < stored["one-bounce"]["share"] <= stored["one-bounce"]["bound"] < 0.2
+    assert stored["one-bounce"]["bound"] == told["one-bounce"]["bound"]
+    assert "predicted" not in stored["one-bounce"]
+    for row in (told["shadows"], told["one-bounce"]):
+        assert row["predicted"]["seconds"] > 0
+        assert row["predicted"]["bytes"] > 0
+    assert precompute(config(scene, tmp_path / "t.zarr", effects="auto"))["status"] == "up to date"
+    # A scene that accepts more error does with less.
+    text = scene.read_text() + "[accuracy]\ntolerance = 0.5\n"
+    shutil.copytree(scene.parent, tmp_path / "coarse")
+    (tmp_path / "coarse" / "scene.toml").write_text(text)
+    coarse = precompute(config(tmp_path / "coarse" / "scene.toml", tmp_path / "c.zarr", effects="auto", dry_run=True))
+    assert coarse["bounces"] == 0
+    assert coarse["predicted"]["bytes"] < plan["predicted"]["bytes"]
 
 
 def test_summary_agrees_with_the_store(scene, tmp_path):

@@ -1,8 +1,8 @@
 """The few small and bright places of a map that deserve light of their own: a sun, a lamp.
 
 A cluster's visible fraction blurs the shadow of a light that is much smaller than the cluster. What lies in one texel
-of a fine cube and has a good part of all flux is therefore taken out of the map and handed over as a point, for which
-rays can tell exactly who sees it.
+of a fine cube and has a good part of all flux is therefore taken out of the map and handed over as points, for which
+rays can tell exactly who sees them: one point, or where the part is large up to three a side, for the penumbra.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from relightcli.core.sphere import cube
 RESOLUTION = 256  # of the cube: 0.35 degrees
 WIDEST = math.radians(0.75)  # of a pixel: larger ones are no points but areas
 LEAST = 0.01  # of the map's flux
-MOST = 24
+MOST = 24  # texels
+FINER = (0.05, 0.3)  # of the map's flux: from here on 2, and 3, points along the side of a texel
 
 
 class Points(NamedTuple):
@@ -50,24 +51,61 @@ def split_points(
     if len(bright) == 0:
         return radiance, none, bright
     row, column = np.divmod(bright, width)
-    latitude = math.pi * (0.5 - (row + 0.5) / height)
-    longitude = math.pi * (1.0 - 2.0 * (column + 0.5) / width) + math.radians(math.fmod(rotate_degrees, 360.0))
-    d = np.stack([np.sin(longitude) * np.cos(latitude), np.sin(latitude), np.cos(longitude) * np.cos(latitude)], axis=1)
+    turn = math.radians(math.fmod(rotate_degrees, 360.0))
+    d = pixel_parts(row, column, (height, width), turn, 1).reshape(-1, 3)
     flux = source.reshape(-1, 3)[bright].astype(np.float64) * solid[row, None]
     texel, owner = np.unique(cube.texel_index(d, RESOLUTION), return_inverse=True)
-    weight = flux.sum(axis=1)
     total = np.bincount(owner, _luminance(flux), len(texel))
     chosen = np.argsort(-total, kind="stable")[:MOST]
     chosen = np.sort(chosen[total[chosen] >= least])
     if len(chosen) == 0:
         return radiance, none, np.zeros(0, np.int64)
-    mean = np.stack([np.bincount(owner, weight * d[:, x], len(texel)) for x in range(3)], axis=1)[chosen]
-    summed = np.zeros((len(texel), 3))
-    np.add.at(summed, owner, flux)
+    found = []
+    for k in chosen:
+        own = np.flatnonzero(owner == k)
+        parts = 1 + int(np.searchsorted(FINER, total[k] / float(rows.sum()), side="right"))
+        found.append(_points(row[own], column[own], flux[own], (height, width), turn, parts))
     taken = bright[np.isin(owner, chosen)]
     rest = source.copy()
     rest.reshape(-1, 3)[taken] = 0.0
-    return rest, Points(mean / np.linalg.norm(mean, axis=1, keepdims=True), summed[chosen]), taken
+    return rest, Points(*(np.concatenate(part) for part in zip(*found, strict=True))), taken
+
+
+def _points(
+    row: NDArray[np.int64],
+    column: NDArray[np.int64],
+    flux: NDArray[np.float64],
+    size: tuple[int, int],
+    turn: float,
+    parts: int,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Directions (K, 3) and flux (K, 3) of the pixels of a texel, as `parts` x `parts` points or a few more.
+
+    Few pixels are cut, many are gathered by the texels of a cube that is `parts` times finer.
+    """
+    cuts = math.ceil(parts / math.sqrt(len(row)))
+    d = pixel_parts(row, column, size, turn, cuts).reshape(-1, 3)
+    flux = np.repeat(flux / cuts**2, cuts**2, axis=0)
+    texel = np.arange(len(d)) if 1 < len(d) == parts**2 else cube.texel_index(d, RESOLUTION * parts)
+    kinds, owner = np.unique(texel, return_inverse=True)
+    weight = flux.sum(axis=1)
+    mean = np.stack([np.bincount(owner, weight * d[:, x], len(kinds)) for x in range(3)], axis=1)
+    summed: NDArray[np.float64] = np.stack([np.bincount(owner, flux[:, c], len(kinds)) for c in range(3)], axis=1)
+    return mean / np.linalg.norm(mean, axis=1, keepdims=True), summed
+
+
+def pixel_parts(
+    row: NDArray[np.int64], column: NDArray[np.int64], size: tuple[int, int], turn: float, parts: int
+) -> NDArray[np.float64]:
+    """Directions (n, parts, parts, 3) of n pixels' parts of equal solid angle; turn: of the map about +Y, radians."""
+    height, width = size
+    place = (np.arange(parts) + 0.5) / parts
+    top, bottom = np.cos(np.pi * row / height), np.cos(np.pi * (row + 1) / height)
+    sine = (top[:, None] + (bottom - top)[:, None] * place)[:, :, None]
+    longitude = (np.pi * (1.0 - 2.0 * (column[:, None] + place) / width) + turn)[:, None, :]
+    cosine = np.sqrt(np.maximum(1.0 - sine * sine, 0.0))
+    sine = np.broadcast_to(sine, (len(row), parts, parts))
+    return np.stack([np.sin(longitude) * cosine, sine, np.cos(longitude) * cosine], axis=-1)
 
 
 def _luminance(flux: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -7,6 +7,7 @@ Source: Khronos glTF 2.0 specification, section 3.11 and appendix C, named [glTF
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -59,24 +60,57 @@ class Clip:
         return np.unique(np.concatenate(times)) if times else np.zeros(1)
 
 
-def sample(channel: Channel, seconds: F64) -> F64:
-    """The channel's values (M, W) at times (M,); before the first key and after the last, those keys' values.
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Channels of one path that have their times and their interpolation in common.
+
+    nodes (C,); times (K,); values (K, C, W), for CUBICSPLINE (K, 3, C, W).
+    """
+
+    path: PathName
+    interpolation: Interpolation
+    nodes: NDArray[np.int64]
+    times: F64
+    values: F64
+
+
+@lru_cache(maxsize=256)
+def tracks(clip: Clip) -> tuple[Track, ...]:
+    """The clip's channels, put together: exporters and motion capture give many the same times."""
+    groups: dict[tuple[str, str, bytes], list[Channel]] = {}
+    for channel in clip.channels:
+        groups.setdefault((channel.path, channel.interpolation, channel.times.tobytes()), []).append(channel)
+    return tuple(
+        Track(
+            group[0].path,
+            group[0].interpolation,
+            np.array([c.node for c in group]),
+            group[0].times,
+            np.stack([c.values for c in group], axis=-2),
+        )
+        for group in groups.values()
+    )
+
+
+def sample(track: Channel | Track, seconds: F64) -> F64:
+    """Values (M, W) of a channel, (M, C, W) of a track, at times (M,); outside the keys, those of the first or last.
 
     STEP holds the last key. LINEAR mixes two keys, rotations along the shorter arc (slerp). CUBICSPLINE is Hermite's
     spline through the keys; rotations are then scaled to unit length [glTF, C.3 to C.5].
     """
-    times, values = channel.times, channel.values
-    spline = channel.interpolation == "CUBICSPLINE"
+    times, values = track.times, track.values
+    spline = track.interpolation == "CUBICSPLINE"
     t = np.clip(np.asarray(seconds, np.float64), times[0], times[-1])
     k = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 1)
-    if channel.interpolation == "STEP" or len(times) == 1:
+    if track.interpolation == "STEP" or len(times) == 1:
         return np.asarray(values[k, 1] if spline else values[k])
     k = np.minimum(k, len(times) - 2)
-    span = (times[k + 1] - times[k])[:, None]
-    u = (t - times[k])[:, None] / span
-    if channel.interpolation == "LINEAR":
-        if channel.path == "rotation":
-            return slerp(values[k], values[k + 1], u[:, 0])
+    each = (len(t), *[1] * (values.ndim - (2 if spline else 1)))
+    span = (times[k + 1] - times[k]).reshape(each)
+    u = (t - times[k]).reshape(each) / span
+    if track.interpolation == "LINEAR":
+        if track.path == "rotation":
+            return slerp(values[k], values[k + 1], u)
         return np.asarray((1.0 - u) * values[k] + u * values[k + 1])
     u2, u3 = u * u, u * u * u
     mixed = (
@@ -85,7 +119,7 @@ def sample(channel: Channel, seconds: F64) -> F64:
         + (3.0 * u2 - 2.0 * u3) * values[k + 1, 1]
         + span * (u3 - u2) * values[k + 1, 0]
     )
-    return unit_quaternion(mixed) if channel.path == "rotation" else np.asarray(mixed)
+    return unit_quaternion(mixed) if track.path == "rotation" else np.asarray(mixed)
 
 
 def unit_quaternion(q: F64) -> F64:
@@ -96,17 +130,17 @@ def unit_quaternion(q: F64) -> F64:
 
 
 def slerp(a: F64, b: F64, u: F64) -> F64:
-    """From unit quaternions a (M, 4) to b (M, 4) at u (M,) in 0..1, along the shorter arc."""
-    dot = (a * b).sum(axis=-1)
-    b = np.where(dot[:, None] < 0.0, -b, b)
+    """From unit quaternions a (..., 4) to b (..., 4) at u (..., 1) in 0..1, along the shorter arc."""
+    dot = (a * b).sum(axis=-1, keepdims=True)
+    b = np.where(dot < 0.0, -b, b)
     dot = np.abs(dot)
     # atan2 keeps small angles exact where arccos has half the digits.
-    angle = np.arctan2(np.sqrt(((b - dot[:, None] * a) ** 2).sum(axis=-1)), dot)
+    angle = np.arctan2(np.sqrt(((b - dot * a) ** 2).sum(axis=-1, keepdims=True)), dot)
     near = angle < 1e-9
     sine = np.where(near, 1.0, np.sin(angle))
     first = np.where(near, 1.0 - u, np.sin((1.0 - u) * angle) / sine)
     second = np.where(near, u, np.sin(u * angle) / sine)
-    return unit_quaternion(first[:, None] * a + second[:, None] * b)
+    return unit_quaternion(first * a + second * b)
 
 
 def multiply(a: F64, b: F64) -> F64:
@@ -149,7 +183,7 @@ def rotation_vector(q: F64) -> F64:
 
 
 def nearest_turn(vectors: F64, references: F64) -> F64:
-    """Rotation vectors (M, 3), each moved by whole turns about its own axis to be nearest to its reference (M, 3)."""
+    """Rotation vectors (..., 3), each moved by whole turns about its own axis to be nearest to its reference."""
     length = np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True))
     along = np.where(length > 1e-12, vectors, references)  # at no rotation every axis is as good
     size = np.sqrt((along * along).sum(axis=-1, keepdims=True))

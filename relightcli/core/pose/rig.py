@@ -19,12 +19,14 @@ from numpy.typing import NDArray
 from relightcli.core.pose.clip import (
     Channel,
     Clip,
+    Track,
     conjugate,
     multiply,
     nearest_turn,
     rotation_matrix,
     rotation_vector,
     sample,
+    tracks,
     unwrap_vectors,
 )
 
@@ -96,8 +98,8 @@ def joint_matrices(rig: Rig, clip: Clip | None, seconds: float = 0.0) -> F64:
 def _animated(rig: Rig, clip: Clip, seconds: float, local: F64) -> F64:
     moved = sorted({c.node for c in clip.channels})
     state = {"translation": rig.translation.copy(), "rotation": rig.rotation.copy(), "scale": rig.scale.copy()}
-    for channel in clip.channels:
-        state[channel.path][channel.node] = sample(channel, np.array([seconds]))[0]
+    for track in tracks(clip):
+        state[track.path][track.nodes] = sample(track, np.array([seconds]))[0]
     local[moved] = 0.0
     local[moved, :3, :3] = rotation_matrix(state["rotation"][moved]) * state["scale"][moved][:, None, :]
     local[moved, :3, 3] = state["translation"][moved]
@@ -208,22 +210,18 @@ def pose_features(rig: Rig, clip: Clip | None, seconds: float = 0.0) -> F64:
 
 def clip_features(rig: Rig, clip: Clip, seconds: F64) -> F64:
     """`pose_features` (M, j) at several times (M,) of one clip."""
-    features, count = _features(rig)
-    out = np.zeros((len(seconds), count))
-    for feature in features:
-        channel = _channel(clip, feature.node, feature.path)
-        if channel is None:
-            continue
-        values = sample(channel, seconds)
-        if feature.path == "rotation":
-            times, lifted = _lifted(rig, channel)
-            before = np.maximum(np.searchsorted(times, np.minimum(seconds, times[-1]), side="right") - 1, 0)
-            values = nearest_turn(_relative(rig, feature.node, values), lifted[before])
+    out = np.zeros((len(seconds), _features(rig)[1]))
+    for track in _feature_tracks(rig, clip):
+        values = sample(track.track, seconds)[:, track.chosen]
+        nodes = track.track.nodes[track.chosen]
+        if track.track.path == "rotation":
+            before = np.searchsorted(track.times, np.minimum(seconds, track.times[-1]), side="right") - 1
+            values = nearest_turn(_relative(rig, nodes, values), track.lifted[np.maximum(before, 0)])
         else:
-            values = values - getattr(rig, feature.path)[feature.node]
-            if feature.path == "translation":
+            values = values - getattr(rig, track.track.path)[nodes]
+            if track.track.path == "translation":
                 values = values / _extent(rig)
-        out[:, feature.start : feature.start + 3] = values
+        out[:, track.columns] = values
     return out
 
 
@@ -275,7 +273,7 @@ def _channel(clip: Clip, node: int, path: str) -> Channel | None:
     return next((c for c in clip.channels if c.node == node and c.path == path), None)
 
 
-def _followed(channel: Channel) -> F64:
+def _followed(channel: Channel | Track) -> F64:
     """Times close enough together to follow a rotation through."""
     times = channel.times
     if channel.interpolation == "STEP" or len(times) == 1:
@@ -285,15 +283,40 @@ def _followed(channel: Channel) -> F64:
     return np.concatenate([between.reshape(-1), times[-1:]])
 
 
-def _relative(rig: Rig, node: int, rotations: F64) -> F64:
-    return rotation_vector(multiply(conjugate(rig.rotation[node])[None], rotations))
+def _relative(rig: Rig, nodes: NDArray[np.int64], rotations: F64) -> F64:
+    """Rotation vectors (M, C, 3) relative to rest of nodes (C,) that are turned by rotations (M, C, 4)."""
+    return rotation_vector(multiply(conjugate(rig.rotation[nodes])[None], rotations))
 
 
-@lru_cache(maxsize=4096)
-def _lifted(rig: Rig, channel: Channel) -> tuple[F64, F64]:
-    """Times (M,) and continuous rotation vectors (M, 3) of a rotation channel."""
-    times = _followed(channel)
-    return times, unwrap_vectors(_relative(rig, channel.node, sample(channel, times)))
+@dataclass(frozen=True)
+class _FeatureTrack:
+    """What of a track counts: `chosen` of its channels, `columns` (C, 3) among the features; of rotations, times (T,)
+    and continuous rotation vectors `lifted` (T, C, 3) relative to rest."""
+
+    track: Track
+    chosen: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    times: F64
+    lifted: F64
+
+
+@lru_cache(maxsize=256)
+def _feature_tracks(rig: Rig, clip: Clip) -> tuple[_FeatureTrack, ...]:
+    starts = {(f.node, f.path): f.start for f in _features(rig)[0]}
+    out = []
+    for track in tracks(clip):
+        chosen = np.array([i for i, n in enumerate(track.nodes) if (int(n), track.path) in starts], np.int64)
+        if not len(chosen):
+            continue
+        first = np.array([starts[int(n), track.path] for n in track.nodes[chosen]])
+        times, lifted = np.zeros(0), np.zeros((0, len(chosen), 3))
+        if track.path == "rotation":
+            times = _followed(track)
+            lifted = _relative(rig, track.nodes[chosen], sample(track, times)[:, chosen])
+            for column in range(len(chosen)):
+                lifted[:, column] = unwrap_vectors(np.ascontiguousarray(lifted[:, column]))
+        out.append(_FeatureTrack(track, chosen, first[:, None] + np.arange(3), times, lifted))
+    return tuple(out)
 
 
 def _extent(rig: Rig) -> float:

@@ -104,12 +104,14 @@ def trace_rows(
     bounces: int,
     seed: int = 0,
     background: bool = False,
+    blocks: bool = True,
 ) -> Tile:
     """Trace rows `rows[0] <= y < rows[1]` of a picture, passes `passes[0] <= p < passes[1]`.
 
     scene: `shading_scene(...)`; tracer: over the same positions and faces; environment: `make_latlong(...)`, a black
     1 x 1 map for none; samples_per_pass >= 1, best a power of two; bounces K >= 0; background: fill what the camera
-    sees past the scene with the environment. Memory: 700 bytes per path, max(BATCH, samples_per_pass) paths.
+    sees past the scene with the environment; blocks: whether surfaces block light, needed for K > 0. Memory: 700 bytes
+    per path, max(BATCH, samples_per_pass) paths.
     """
     film = make_film(camera)
     first, count = rows[0] * film.width, (rows[1] - rows[0]) * film.width
@@ -122,7 +124,7 @@ def trace_rows(
         stop = min(start + chunk, count)
         for number in range(*passes):
             paths = _Paths(seed, first + start, stop - start, number, samples_per_pass)
-            values, hit, traced = _trace_paths(scene, tracer, environment, film, paths, bounces, background)
+            values, hit, traced = _trace_paths(scene, tracer, environment, film, paths, bounces, background, blocks)
             estimators.add_pass(
                 values, hit, samples_per_pass, layers[:, start:stop], squares[start:stop], alpha[start:stop]
             )
@@ -156,6 +158,7 @@ def _trace_paths(
     paths: _Paths,
     bounces: int,
     background: bool,
+    blocks: bool,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_], int]:
     """Radiance per path and layer (N, L, 3), whether its camera ray hit anything (N,), and the number of rays."""
     n = paths.pixels * paths.samples
@@ -172,6 +175,7 @@ def _trace_paths(
         estimators.add_background(environment, hits.face, direction, values)
     surface = surface_at(scene, hits.face, hits.u, hits.v, direction, np.ones((n, 3)), np.arange(n))
 
+    shadow: Tracer | _Nothing = tracer if blocks else _Nothing()
     lit_by_lights = scene.lights.number > 0
     two_origins = bool((scene.model == TRANSLUCENT).any())
     for k in range(bounces + 1):
@@ -184,7 +188,7 @@ def _trace_paths(
             source, below, direction, gain, share = estimators.sample_environment(
                 scene, environment, surface, keys, paths.samples, 3 * k + 1, known
             )
-            blocked = tracer.occluded(_origins(front, back, source, below), direction.astype(np.float32))
+            blocked = shadow.occluded(_origins(front, back, source, below), direction.astype(np.float32))
             estimators.add_light(values, k, lobes, surface.path, source, gain, blocked, share)
             rays += len(source)
         if lit_by_lights:
@@ -193,7 +197,7 @@ def _trace_paths(
             )
             origins = _origins(front, back, source, below)
             reach = np.full(len(source), 1.0 - LIGHT_CLEARANCE, np.float32)
-            blocked = tracer.occluded(origins, tracer.to_local(target) - origins, reach)
+            blocked = shadow.occluded(origins, tracer.to_local(target) - origins, reach)
             estimators.add_light(values, k, lobes, surface.path, source, gain, blocked, share)
             rays += len(source)
 
@@ -207,12 +211,12 @@ def _trace_paths(
         toward = direction.astype(np.float32)
         rays += len(source)
         if last and not lit_by_lights:
-            face = np.where(tracer.occluded(origins, toward), 0, -1).astype(np.int32)
+            face = np.where(shadow.occluded(origins, toward), 0, -1).astype(np.int32)
             estimators.add_found_environment(
                 values, k, lobes, shares, surface.path, source, environment, face, direction, throughput, density
             )
             break
-        hits = tracer.intersect(origins, toward)
+        hits = shadow.intersect(origins, toward)
         if environment.lit:
             estimators.add_found_environment(
                 values, k, lobes, shares, surface.path, source, environment, hits.face, direction, throughput, density
@@ -226,6 +230,30 @@ def _trace_paths(
             surface = surface_at(scene, hits.face, hits.u, hits.v, direction, throughput, surface.path[source])
         shares[:] = 0.0
     return values, covered, rays
+
+
+class _Nothing:
+    """Blocks no ray."""
+
+    def occluded(
+        self,
+        origins: NDArray[np.float32],
+        directions: NDArray[np.float32],
+        max_distance: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.bool_]:
+        return np.zeros(len(origins), bool)
+
+    def intersect(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> _Missed:
+        zero = np.zeros(len(origins), np.float32)
+        return _Missed(np.full(len(origins), -1, np.int32), zero, zero, np.full(len(origins), np.inf, np.float32))
+
+
+@dataclass(frozen=True)
+class _Missed:
+    face: NDArray[np.int32]
+    u: NDArray[np.float32]
+    v: NDArray[np.float32]
+    distance: NDArray[np.float32]
 
 
 def _origins(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,10 @@ class Receivers:
 
     def __len__(self) -> int:
         return len(self.position)
+
+    def at(self, rows: NDArray[np.integer[Any]]) -> Receivers:
+        """Some of them."""
+        return Receivers(self.position[rows], self.normal[rows], self.object[rows], self.vertex[rows], self.side[rows])
 
 
 def vertex_receivers(

@@ -11,6 +11,8 @@ from relightcli.core.pose.clip import (
     rotation_matrix,
     rotation_vector,
     sample,
+    tracks,
+    unit_quaternion,
     unwrap_vectors,
 )
 from tests.core.pose.rigs import channel, clip, turn_z
@@ -89,3 +91,22 @@ def test_turns_are_counted_through_several_rounds():
     vectors = rotation_vector(np.array([turn_z(a) for a in angles]))
     assert np.abs(np.diff(vectors[:, 2])).max() > 5  # as they come, they jump
     assert np.allclose(unwrap_vectors(vectors), np.radians(angles)[:, None] * [0, 0, 1], atol=1e-12)
+
+
+@pytest.mark.parametrize("interpolation", ["STEP", "LINEAR", "CUBICSPLINE"])
+def test_tracks_are_their_channels(rng, interpolation):
+    def one(node, times):
+        path, width = ("scale", 3) if node % 2 else ("rotation", 4)
+        values = rng.normal(size=(len(times), 3, width))
+        if path == "rotation":
+            values = unit_quaternion(values)
+        return channel(node, path, times, values if interpolation == "CUBICSPLINE" else values[:, 1], interpolation)
+
+    same, other = [0.0, 1.0, 2.0], [0.0, 1.5, 2.0]
+    c = clip(*(one(node, same if node < 4 else other) for node in range(6)))
+    assert [t.nodes.tolist() for t in tracks(c)] == [[0, 2], [1, 3], [4], [5]]
+    at = np.linspace(-0.5, 2.5, 13)
+    for track in tracks(c):
+        together = sample(track, at)
+        for k, node in enumerate(track.nodes):
+            assert np.array_equal(together[:, k], sample(c.channels[node], at))

@@ -1,0 +1,295 @@
+"""The error of light at receivers, measured: some rows of pictures against two runs of the path tracer.
+
+With S what the receivers give at a pixel and A, B what two runs find there, (S - A)(S - B) has the square of the error
+as its mean, whatever the noise of the runs (`plan.pilot`). Views and skies are not those of the pilot.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import relight_formats as formats
+from relightcli.adapters.rays import Tracer
+from relightcli.core.lights.latlong import make_latlong
+from relightcli.core.lights.sky import sky_latlong
+from relightcli.core.shade import picture, primary
+from relightcli.core.transport import visibility
+from relightcli.core.transport.camera import make_film
+from relightcli.core.transport.light_visibility import light_bits
+from relightcli.core.transport.local_lights import pack_lights
+from relightcli.core.transport.path_tracer import trace_rows
+from relightcli.core.transport.receivers import Receivers, receivers_of_vertices
+from relightcli.core.transport.shading import shading_scene
+from relightcli.plan.pilot import NOTHING, Share, larger, share_of, views
+from relightcli.scene.model import Camera, Geometry, Material, Scene
+from relightcli.stages.lighting import LightingStore, together
+
+PIXELS = 2048  # of a picture that are compared, about
+STRIP = 4  # rows that are taken together, so that outlines are found
+SAMPLES = 8  # paths a pixel, in each of the two runs
+TURN = 12.0  # degrees about the upright axis from a camera of the scene to a view of the check
+MORE = 3  # interreflections that the truth has beyond the store's
+MOST_VIEWS = 2
+
+Sky = NDArray[np.float32]
+
+
+def check_skies() -> dict[str, Sky]:
+    """Skies that nothing is chosen by."""
+    size = (128, 256)
+    return {
+        "sun at 25 degrees": sky_latlong(25.0, 100.0, size=size),
+        "sun at 50 degrees": sky_latlong(50.0, 230.0, size=size),
+        "overcast": sky_latlong(30.0, size=size, overcast=True),
+    }
+
+
+def check_views(scene: Scene, geometry: Geometry, only: str | None) -> list[Camera]:
+    """Views that nothing is chosen by: the scene's, turned; of a store of pixels the one that it is for."""
+    if only is not None:
+        return [scene.cameras[only]]
+    cameras = list(scene.cameras.values())[:MOST_VIEWS]
+    if not cameras:
+        return [replace(c, size=(64, 48)) for c in views([], geometry.positions, geometry.faces)[:MOST_VIEWS]]
+    c, s = math.cos(math.radians(TURN)), math.sin(math.radians(TURN))
+    turned = []
+    for camera in cameras:
+        x, y, z = np.subtract(camera.eye, camera.target)
+        eye = np.add(camera.target, (c * x + s * z, y, c * z - s * x))
+        turned.append(replace(camera, eye=(float(eye[0]), float(eye[1]), float(eye[2]))))
+    return turned
+
+
+def edited(materials: dict[str, Material]) -> dict[str, Material]:
+    """The materials after an edit: what is adjustable has its colours turned round."""
+    return {
+        name: replace(m, diffuse=m.diffuse[1:] + m.diffuse[:1], specular=m.specular[1:] + m.specular[:1])
+        if m.adjustable
+        else m
+        for name, m in materials.items()
+    }
+
+
+@dataclass(frozen=True)
+class Strips:
+    """Rows of a camera's picture, and how receivers make them: one matrix for each range of rows."""
+
+    camera: Camera
+    rows: list[tuple[int, int]]
+    matrices: list[picture.PixelMatrix]
+
+    def used(self, count: int) -> NDArray[np.bool_]:
+        """Which of `count` receivers the strips need."""
+        return np.any([m.used(count) for m in self.matrices], axis=0)  # type: ignore[no-any-return]
+
+    def renumbered(self, new: NDArray[np.int64]) -> Strips:
+        """The same strips of receivers that got other numbers."""
+        return replace(self, matrices=[replace(m, receiver=new[m.receiver].astype(np.int32)) for m in self.matrices])
+
+    def pixels(self, diffuse: NDArray[np.float32], specular: NDArray[np.float32] | None) -> NDArray[np.float64]:
+        """Radiance (n, 3) of the strips' pixels, of that of the receivers."""
+        return np.concatenate([picture.assemble(m, diffuse, specular, 1) for m in self.matrices]).astype(np.float64)
+
+
+def rows_of(camera: Camera) -> list[tuple[int, int]]:
+    """Strips of rows, evenly spread, with about PIXELS pixels together."""
+    width, height = camera.size
+    strips = max(1, PIXELS // (width * STRIP))
+    if strips * STRIP >= height:
+        return [(0, height)]
+    tops = ((np.arange(strips) + 0.5) * height / strips - 0.5 * STRIP).astype(int)
+    return [(int(top), int(top) + STRIP) for top in tops]
+
+
+def vertex_strips(
+    geometry: Geometry,
+    tracer: Tracer,
+    camera: Camera,
+    front: NDArray[np.int32],
+    back: NDArray[np.int32],
+    buried: NDArray[np.bool_],
+) -> Strips:
+    """Strips of a picture whose receivers are vertices; see `picture.vertex_matrix`."""
+    normals = primary.face_normals(geometry.positions, geometry.faces)
+    film = make_film(camera)
+    base = primary.TEXTURE_GRID if geometry.textures else primary.BASE_GRID
+    rows, matrices = rows_of(camera), []
+    for top, bottom in rows:
+        part = film._replace(corner=film.corner + top * film.step_y, height=bottom - top)
+        samples = primary.see(tracer, part, geometry.face_object, normals, base)
+        count = film.width * (bottom - top)
+        matrices.append(picture.vertex_matrix(geometry, samples, normals, front, back, buried, count))
+    return Strips(camera, rows, matrices)
+
+
+def pixel_strips(
+    camera: Camera, pixel: NDArray[np.int32], weight: NDArray[np.float32], texture: NDArray[np.float32]
+) -> Strips:
+    """Strips of a picture whose pixels are the receivers; see `picture.sample_matrix`."""
+    width, height = camera.size
+    whole = picture.sample_matrix(pixel, weight, texture, width * height)
+    rows, matrices = rows_of(camera), []
+    for top, bottom in rows:
+        start = whole.start[top * width : bottom * width + 1]
+        part = slice(start[0], start[-1])
+        matrices.append(
+            picture.PixelMatrix(start - start[0], whole.receiver[part], whole.weight[part], whole.texture[part])
+        )
+    return Strips(camera, rows, matrices)
+
+
+class Draft:
+    """A store that is still being written, to be read by `LightingStore`."""
+
+    def __init__(self, writer: formats.Writer) -> None:
+        self.writer = writer
+        self.kind, self.path = "transfer", writer.path
+        self.settings, self.attrs, self.layouts, self.read = writer.settings, writer.attrs, writer.layouts, writer.read
+
+    def names(self) -> list[str]:
+        return sorted(self.layouts)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.layouts
+
+    def array(self, name: str) -> Any:
+        return formats.worker_array(self.writer.partial_path, name)
+
+
+class Trial(LightingStore):
+    """Some receivers on vertices, with their visibility traced at once and kept in memory."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        geometry: Geometry,
+        points: Receivers,
+        buried: NDArray[np.bool_],
+        tracer: Tracer,
+        resolution: int,
+        refine: int,
+        seed: int,
+    ) -> None:
+        self.scene, self.geometry = scene, geometry
+        self.threads = 1
+        self.position, self.normal, self.object = points.position, points.normal, points.object
+        self.side, self.vertex = points.side, points.vertex
+        self.resolution, self.basis, self.bounces, self.pixels = resolution, "visibility", 0, 0
+        self._buried = buried
+        self._coated = None
+        lamps = pack_lights(scene.lights.values())
+        lit: dict[str, Any] = {}
+        if lamps.number:
+            lit["lights/bits"] = light_bits(tracer, lamps, points.position, points.normal)[0]
+        self.store: Any = _Memory(lit)
+        clock = time.perf_counter()
+        self._seen_bits = visibility.trace_visibility(
+            tracer, points.position, points.normal, resolution, refine, seed
+        ).bits
+        self.seconds = time.perf_counter() - clock
+
+    @property
+    def camera_name(self) -> str | None:
+        return None
+
+    def buried(self) -> NDArray[np.bool_]:
+        return self._buried
+
+    def blocks(self, first: int = 0, last: int | None = None) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
+        last = len(self) if last is None else last
+        yield slice(first, last), self._seen_bits[first:last]
+
+
+class _Memory(dict[str, Any]):
+    """Arrays by name."""
+
+    def read(self, name: str) -> Any:
+        return self[name]
+
+
+@dataclass(frozen=True)
+class Judge:
+    """The path tracer on the scene as it is, before faces were cut."""
+
+    scene: Scene
+    geometry: Geometry
+    tracer: Tracer
+
+    def error(
+        self,
+        lighting: LightingStore,
+        strips: Sequence[Strips],
+        skies: dict[str, Sky],
+        bounces: int,
+        truth: int,
+        edits: bool,
+        seed: int = 1000,
+    ) -> Share:
+        """The largest error of the receivers' light with `bounces` against `truth` interreflections."""
+        worst = NOTHING
+        changes = [self.scene.materials]
+        if edits and any(m.adjustable for m in self.scene.materials.values()):
+            changes.append(edited(self.scene.materials))
+        for view in strips:
+            eye = np.array(view.camera.eye)
+            d = eye - lighting.position
+            towards = (d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-300)).astype(np.float32)
+            active = view.used(len(lighting))
+            for number, (name, sky) in enumerate(skies.items()):
+                materials = changes[number % len(changes)]
+                light = together(lighting.exit_radiance(sky, 0.0, materials, towards, active, None, bounces))
+                ours = view.pixels(light.diffuse, light.specular)
+                runs = [self.trace(view, sky, materials, truth, seed + run) for run in (0, 1)]
+                where = f"camera {view.camera.name}, {name}{', edited' if number % len(changes) else ''}"
+                worst = larger(worst, share_of(ours - runs[0], ours - runs[1], runs[0], runs[1], where))
+        return worst
+
+    def trace(
+        self, view: Strips, sky: Sky, materials: dict[str, Material], bounces: int, seed: int
+    ) -> NDArray[np.float64]:
+        """One run of the strips' pixels, (n, 3)."""
+        shading = shading_scene(self.geometry, list(materials.values()), self.scene.lights.values())
+        environment = make_latlong(sky)
+        out = []
+        for rows in view.rows:
+            tile = trace_rows(shading, self.tracer, environment, view.camera, rows, (0, 1), SAMPLES, bounces, seed)
+            out.append(tile.layers.sum(axis=0).reshape(-1, 3))
+        return np.concatenate(out)
+
+
+def trial(
+    judge: Judge,
+    geometry: Geometry,
+    points: Receivers,
+    buried: NDArray[np.bool_],
+    strips: Sequence[Strips],
+    resolutions: Sequence[int],
+    refine: int,
+    skies: dict[str, Sky],
+    most: float,
+    seed: int,
+) -> list[tuple[int, Share]]:
+    """The error of direct light by resolution of the light, from coarse to fine, until it is at most `most`.
+
+    geometry: the mesh that the receivers `points` are on; only receivers that the strips need are traced."""
+    tracer = Tracer(geometry.positions, geometry.faces)
+    used = np.any([s.used(len(points)) for s in strips], axis=0)
+    front, back = receivers_of_vertices(points.vertex, points.side, len(geometry.positions))
+    other = np.where(points.side > 0, back[points.vertex], front[points.vertex])
+    used[other[used & (points.vertex >= 0) & (other >= 0)]] = True  # light may come through from there
+    rows = np.flatnonzero(used)
+    strips = [s.renumbered(np.cumsum(used) - 1) for s in strips]
+    out: list[tuple[int, Share]] = []
+    for resolution in resolutions:
+        lighting = Trial(judge.scene, geometry, points.at(rows), buried[rows], tracer, resolution, refine, seed)
+        out.append((resolution, judge.error(lighting, strips, skies, 0, 0, edits=False)))
+        if out[-1][1].share <= most:
+            break
+    return out

@@ -1,0 +1,124 @@
+"""The promise of `precompute --tolerance`: a resolution of light that keeps it, and the error measured at the end."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+import relight_formats as formats
+from relightcli.adapters.rays import Tracer
+from relightcli.core.transport.receivers import receivers_of_vertices
+from relightcli.errors import NumericalError
+from relightcli.plan import pilot
+from relightcli.scene.model import Camera, Geometry, Scene
+from relightcli.stages.lighting import LightingStore
+from relightcli.stages.measured_error import (
+    MORE,
+    Draft,
+    Judge,
+    Strips,
+    check_skies,
+    check_views,
+    pixel_strips,
+    trial,
+    vertex_strips,
+)
+from relightcli.stages.receiver_setup import MOST_PIXEL_GRID, PixelReceivers
+
+if TYPE_CHECKING:
+    from relightcli.core.transport.receivers import Receivers
+    from relightcli.stages.precompute import Config
+
+RESOLUTIONS = (16, 32, 64, 128)  # to choose from
+DIRECT = 0.8  # of the tolerance: what direct light may be off by; the square of the rest is for what is left out
+
+
+def _strips(
+    scene: Scene,
+    geometry: Geometry,
+    receivers: Receivers | PixelReceivers,
+    buried: NDArray[np.bool_] | None,
+    cameras: list[Camera],
+) -> list[Strips]:
+    """Some rows of pictures made from the receivers."""
+    if isinstance(receivers, PixelReceivers):
+        return [pixel_strips(camera, receivers.pixel, receivers.weight, receivers.texture) for camera in cameras]
+    front, back = receivers_of_vertices(receivers.vertex, receivers.side, len(geometry.positions))
+    tracer = Tracer(geometry.positions, geometry.faces)
+    hidden = np.zeros(len(receivers), bool) if buried is None else buried
+    return [vertex_strips(geometry, tracer, camera, front, back, hidden) for camera in cameras]
+
+
+def _camera_of(config: Config) -> str | None:
+    return None if config.receivers == "vertices" else config.receivers.partition(":")[2]
+
+
+def try_resolutions(
+    config: Config,
+    scene: Scene,
+    source: Geometry,
+    geometry: Geometry,
+    receivers: Receivers | PixelReceivers,
+    buried: NDArray[np.bool_] | None,
+    promise: float,
+) -> list[tuple[int, pilot.Share]]:
+    """Errors of direct light by resolution, up to the one that will do, in the pilot's views and skies."""
+    only = _camera_of(config)
+    cameras = [scene.cameras[only]] if only else list(scene.cameras.values())[: pilot.MOST_VIEWS]
+    if not cameras:
+        cameras = check_views(scene, source, None)
+    points = receivers.points if isinstance(receivers, PixelReceivers) else receivers
+    return trial(
+        Judge(scene, source, Tracer(source.positions, source.faces)),
+        geometry,
+        points,
+        np.zeros(len(points), bool) if buried is None else buried,
+        _strips(scene, geometry, receivers, buried, cameras),
+        [r for r in RESOLUTIONS if config.refine * 4 <= r],
+        config.refine,
+        {name: sky.radiance for name, sky in pilot.skies(False)},
+        DIRECT * promise,
+        config.seed,
+    )
+
+
+def keep_promise(
+    config: Config,
+    promise: float,
+    resolution: int,
+    scene: Scene,
+    source: Geometry,
+    geometry: Geometry,
+    receivers: Receivers | PixelReceivers,
+    buried: NDArray[np.bool_] | None,
+    writer: formats.Writer,
+) -> None:
+    """Measures the error of what was made and keeps it with it; raises NumericalError where it is too large."""
+    clock = time.perf_counter()
+    lighting = LightingStore(cast("formats.Store", Draft(writer)), config.workers)
+    judge = Judge(scene, source, Tracer(source.positions, source.faces))
+    strips = _strips(scene, geometry, receivers, buried, check_views(scene, source, _camera_of(config)))
+    skies = check_skies()
+    bounces = lighting.bounces
+    found = judge.error(lighting, strips, skies, bounces, bounces + MORE, edits=True)
+    measured = {"share": found.share, "bound": found.bound, "where": found.where}
+    writer.set_attrs({"measured_error": {**measured, "tolerance": promise, "seconds": time.perf_counter() - clock}})
+    if found.share <= promise or config.allow_miss:
+        return
+    direct = judge.error(lighting, strips, skies, 0, 0, edits=False)
+    if direct.share <= DIRECT * promise:
+        knob = f"--bounces {bounces + 1} or a finer --bounce-resolution"
+    elif config.receivers == "vertices":
+        knob = f"--receivers pixels:{next(iter(scene.cameras), 'CAMERA')}, or a finer mesh"
+    elif resolution < RESOLUTIONS[-1]:
+        knob = f"--light-resolution {2 * resolution}"
+    else:
+        knob = f"--pixel-grid {min(config.pixel_grid + 1, MOST_PIXEL_GRID)} or --light-resolution {2 * resolution}"
+    raise NumericalError(
+        f"{config.output}: the error is {found.share:.2%} ({found.where}; of direct light {direct.share:.2%}), more "
+        f"than the tolerance of {promise:.2%}. What would help: {knob}. The work is kept in "
+        f"{writer.partial_path.name}; the same command with --allow-miss finishes it as it is"
+    )
