@@ -70,6 +70,13 @@ def _text(result: dict[str, Any]) -> str:
             lines.append(
                 f"  error     {effect}: {cost['wrong_bits']:.1e} of bits wrong, from {int(cost['checked'])} checks"
             )
+    for model in result.get("models", []):
+        kind = f"{model['lobes']} lobes" if model["lobes"] else model["model"]
+        seen = "" if model["held_out"] is None else f", {model['held_out']['bands']:.1%} at held-out ones"
+        lines.append(
+            f"  error     visibility of {model['object']} by {kind}: {model['training']['bands']:.1%} at training "
+            f"frames{seen}"
+        )
     for name, array in result["arrays"].items():
         shape = " x ".join(str(n) for n in array["shape"])
         lines.append(f"  array     {name:24} {array['dtype']:8} {shape:24} {size(array['bytes'])}")

@@ -62,6 +62,9 @@ def inspect(path: Path, verify: bool) -> dict[str, Any]:
         "cost": _cost(store.blocks),
         "summary": store.summary,
     }
+    models = [_model(block) for block in store.blocks if store.kind == "pose" and block["id"].startswith("fit/")]
+    if models:
+        result["models"] = models
     if verify:
         result["problems"] = store.verify()
     return result
@@ -71,6 +74,12 @@ def _unfinished(path: Path, verify: bool) -> dict[str, Any]:
     if verify:
         raise StoreError(f"{path}: is not finished, so there is nothing to verify; run its command again to finish it")
     return {"store": str(path), "complete": False, **formats.progress(path)}
+
+
+def _model(block: dict[str, Any]) -> dict[str, Any]:
+    """What a pose store says of the model of one object's visibility, with its errors."""
+    report = block["report"]
+    return {**block["model"], "training": report["training"], "held_out": report["held_out"]}
 
 
 def _cost(blocks: list[dict[str, Any]]) -> dict[str, Any]:

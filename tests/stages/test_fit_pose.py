@@ -171,6 +171,21 @@ def test_sequences_vertices_and_radiance(fitted, tmp_path):
     assert ply.stat().st_size > 1000
 
 
+def test_what_stands_still_is_lit_as_in_the_transfer_store(tmp_path):
+    """Posing the bar leaves the floor's light as it was, to the bit; layers add up."""
+    transfer = make_store(make_scene(tmp_path, SCENE), **SMALL)
+    store = fit(transfer)
+    before = formats.open_store(render(transfer, "still.zarr")[0]).read("radiance")[0]
+    after = formats.open_store(render(store, "posed.zarr", poses=(POSE,))[0]).read("radiance")[0]
+    floor = formats.open_store(store).read("receivers/object") == 1
+    np.testing.assert_array_equal(before[floor], after[floor])
+    assert np.abs(before[~floor] - after[~floor]).max() > 0.05
+    picture, _ = render(store, "layers.exr", poses=(POSE,), layers=True, background=True)
+    layers = read_layers(picture)
+    parts = [pixels for name, pixels in layers.items() if name not in ("", "A")]
+    np.testing.assert_allclose(np.sum(parts, axis=0), layers[""], atol=1e-5)
+
+
 def test_kinds_and_weights(transfer):
     pictures = {}
     for name, settings in {
@@ -242,6 +257,7 @@ def test_command_line(transfer, tmp_path, capsys):
     result = json.loads(capsys.readouterr().out)
     assert result["objects"][0]["bytes"] > 0
     assert run(["inspect", str(output), "--verify"]) == 0
+    assert "visibility of bar by 2 lobes" in capsys.readouterr().out
     assert run(["fit-pose", str(transfer), "-o", str(output), "--lobes", "1"]) == 3
     assert run(["fit-pose", str(transfer), "-o", str(output), "--lobes", "7"]) == 2
 

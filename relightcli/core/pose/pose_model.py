@@ -126,7 +126,7 @@ def fit_model(
     Raises ValueError for no frames, or numbers that are not finite.
     """
     truth = cosine_weighted(visibility) if settings.weight == "cosine" else visibility
-    training = _Training(features, truth, clip, settings, threads)
+    training = _Training(features, truth, settings, threads)
     part = segments(clip)
     few = _spread(visibility.shape[1], FEW)
     ridge = settings.ridge
@@ -160,26 +160,25 @@ class _Training:
         self,
         features: NDArray[np.float64],
         truth: NDArray[np.float32],
-        clip: NDArray[np.int32],
         settings: Settings,
         threads: int,
         lobes: Lobes | None = None,
     ) -> None:
-        self.features, self.truth, self.clip, self.settings, self.threads = features, truth, clip, settings, threads
+        self.features, self.truth, self.settings, self.threads = features, truth, settings, threads
         if settings.kind == "lobes" and lobes is None:
-            lobes = fit_lobes(truth, settings.lobes, clip, threads)
+            lobes = fit_lobes(truth, settings.lobes, threads)
         self.lobes = lobes
 
     def at(self, vertices: NDArray[np.int64]) -> _Training:
         """The same of some vertices."""
         lobes = None if self.lobes is None else Lobes(*(part[:, vertices] for part in self.lobes))
-        return _Training(self.features, self.truth[:, vertices], self.clip, self.settings, self.threads, lobes)
+        return _Training(self.features, self.truth[:, vertices], self.settings, self.threads, lobes)
 
     def without(self, frames: NDArray[np.bool_]) -> _Training:
         """The same of the other frames. Lobes stay as they were fitted: every frame has its own."""
         lobes = None if self.lobes is None else Lobes(*(part[~frames] for part in self.lobes))
         kept = ~frames
-        return _Training(self.features[kept], self.truth[kept], self.clip[kept], self.settings, self.threads, lobes)
+        return _Training(self.features[kept], self.truth[kept], self.settings, self.threads, lobes)
 
     @cached_property
     def space(self) -> PoseSpace:

@@ -8,10 +8,12 @@ gradient and Gauss-Newton matrix need nothing but Legendre polynomials of the ax
 projection f_l(s) = sum_m v_lm u_lm(s) with its slope (variable projection, [Golub 1973], in Kaufman's form).
 
 Bands l >= 1 alone place the axes: at l = 0 all u are 1, so only the sum of the z_0x matters, kept as one number that is
-exact. Where two lobes meet, a ridge towards the frame before keeps their coefficients from wandering.
+exact.
 
-A vertex's frames are fitted one after the other, each from the lobes before it, so that they keep their identity
-through a clip; every clip starts from the lobes of the vertex's mean visibility.
+Every frame of a vertex is fitted from the lobes of the vertex's mean visibility, and a ridge draws to their
+coefficients where the data leave a choice, as where two lobes meet: so a lobe stays the same lobe whatever the order of
+the frames. Starting each frame from the one before it follows a blocker that crosses another lobe's axis better, and
+was worse at every rig that was tried: what goes wrong once stays wrong, and training frames may lie far apart.
 """
 
 from __future__ import annotations
@@ -29,7 +31,6 @@ from relightcli.core.shade.gather import in_parts
 RIDGE = 1e-2
 STEPS = 12  # of Gauss-Newton and their damped trials, per frame
 FIRST_STEPS = 60  # where a vertex starts
-SETTLE = 5  # fits of a clip's first frame, each drawn to the last, until the mean's lobes are forgotten
 TRIALS = 3  # seeds per lobe that are followed
 ENOUGH = 1e-5  # of the energy: a step that gains less is the last
 MOST_LOBES = 4
@@ -44,8 +45,8 @@ class Lobes(NamedTuple):
     zonal: NDArray[np.float32]
 
 
-def fit_lobes(visibility: NDArray[np.float32], count: int, clip: NDArray[np.int32], threads: int = 1) -> Lobes:
-    """Lobes of visibility (F, V, n^2), count per vertex and frame, in frames whose clip is (F,): rising within clips.
+def fit_lobes(visibility: NDArray[np.float32], count: int, threads: int = 1) -> Lobes:
+    """Lobes of visibility (F, V, n^2), count per vertex and frame.
 
     The result does not depend on `threads`. Raises ValueError for a count outside 1 to MOST_LOBES or values that are
     not finite.
@@ -61,12 +62,10 @@ def fit_lobes(visibility: NDArray[np.float32], count: int, clip: NDArray[np.int3
     axis[..., 2] = 1.0
     zonal = np.zeros((frames, vertices, count, order - 1), np.float32)
     if frames and order > 1:
-        starts = np.ones(frames, bool)
-        starts[1:] = clip[1:] != clip[:-1]
         seeds, norms = _seeds(), unit_norms(order)
 
         def part(a: int, b: int) -> None:
-            _fit(values, starts, order, count, seeds, norms, a, b, axis, zonal)
+            _fit(values, order, count, seeds, norms, a, b, axis, zonal)
 
         in_parts(part, vertices, threads)
     return Lobes(values[..., 0].copy(), axis, zonal)
@@ -426,8 +425,8 @@ def _begin(a, order, total, count, seeds, s, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fit(values, starts, order, count, seeds, norms, first, last, axis, zonal):  # type: ignore[no-untyped-def]
-    a, z, first_z = np.zeros((order, order, 2)), np.zeros((order, count)), np.zeros((order, count))
+def _fit(values, order, count, seeds, norms, first, last, axis, zonal):  # type: ignore[no-untyped-def]
+    a, z = np.zeros((order, order, 2)), np.zeros((order, count))
     s, anchor, room = np.empty((count, 3)), np.empty((count, 3)), _room(count, order)
     for v in range(first, last):
         mean = np.zeros(values.shape[2])
@@ -442,18 +441,15 @@ def _fit(values, starts, order, count, seeds, norms, first, last, axis, zonal): 
         for x in range(count):  # opposite axes say the same, odd bands turned in sign: those above the surface
             if anchor[x, 2] < 0.0:
                 anchor[x] = -anchor[x]
-        total = _load(mean, norms, a)
+        _load(mean, norms, a)
         room.before[:] = 0.0
-        _explain(a, order, anchor, first_z, room)
+        _explain(a, order, anchor, z, room)
+        room.before[:] = z
         for t in range(len(values)):
-            if starts[t]:
-                s[:] = anchor
-                room.before[:] = first_z
+            s[:] = anchor
             total = _load(values[t, v], norms, a)
             if total > 0.0:
-                for _ in range(SETTLE if starts[t] else 1):
-                    _refine(a, order, s, STEPS, ENOUGH * total, z, room)
-                    room.before[:] = z
+                _refine(a, order, s, STEPS, ENOUGH * total, z, room)
             else:
                 z[:] = 0.0
             for x in range(count):

@@ -12,7 +12,7 @@ from tests.core.pose.caps import caps, swing
 
 
 def _fit(visibility: np.ndarray, count: int, threads: int = 1) -> Lobes:
-    return fit_lobes(visibility, count, np.zeros(len(visibility), np.int32), threads)
+    return fit_lobes(visibility, count, threads)
 
 
 def _error(visibility: np.ndarray, lobes: Lobes) -> float:
@@ -77,17 +77,18 @@ def test_swinging_blocker() -> None:
     assert _error(visibility, _fit(visibility, 2)) < 0.0039 + RIDGE
 
 
-def test_lobes_keep_their_identity_through_the_pole_and_the_cut() -> None:
-    """A blocker that crosses the zenith, and one that circles: no axis may jump. 2 degrees of motion a frame; an axis
-    follows its blocker, at twice its speed at most."""
-    tilt = np.linspace(-60.0, 60.0, 61)
-    over = caps(np.where(tilt < 0, 180.0, 0.0), 90.0 - np.abs(tilt), 25.0)
-    round_ = caps(np.linspace(0.0, 360.0, 181), np.full(181, 40.0), 25.0)
-    for visibility in (over, round_):
-        lobes = _fit(visibility[:, None], 2)
+def test_lobes_keep_their_identity() -> None:
+    """A blocker that swings 60 degrees in 40 frames: no axis jumps. It follows its blocker, at twice its speed at most.
+    Frames in another order have the same lobes."""
+    for centre in (0.0, 180.0):
+        _, visibility = swing(centre)
+        lobes = _fit(visibility, 2)
         cosine = (lobes.axis[1:, 0] * lobes.axis[:-1, 0]).sum(-1)
-        assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 4.0
-        assert _error(visibility[:, None], lobes) < 0.01
+        assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 3.0
+    order = np.random.default_rng(0).permutation(41)
+    shuffled = _fit(visibility[order], 2)
+    # The mean is another sum of the same numbers: 1e-16, up to steps that end 1e-5 of the energy before the minimum.
+    np.testing.assert_allclose(shuffled.axis, lobes.axis[order], atol=1e-2)
 
 
 def test_open_and_blocked() -> None:
@@ -113,12 +114,6 @@ def test_neither_threads_nor_neighbours_matter() -> None:
     for a, b, c in zip(one, two, alone, strict=True):
         np.testing.assert_array_equal(a, b)
         np.testing.assert_array_equal(a[:, 7:8], c)
-
-
-def test_every_clip_starts_afresh() -> None:
-    visibility = swing(0.0, 11)[1]
-    twice = fit_lobes(np.concatenate([visibility, visibility]), 2, np.repeat(np.arange(2, dtype=np.int32), 11))
-    np.testing.assert_array_equal(twice.axis[:11], twice.axis[11:])
 
 
 def test_two_lobes_that_are_one() -> None:
