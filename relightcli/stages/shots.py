@@ -10,25 +10,29 @@
     env_rotate = 0                  # degrees; this and everything below is interpolated linearly between keys
     exposure = 0
     set = { "gold.roughness" = 0.2, "red.diffuse" = [0.6, 0.1, 0.1], "floor" = "blue-acrylic" }
+    move = { ball = [0, 1, 2] }     # three, six or sixteen numbers as `--move` takes them, the same number in every key
 
     [[key]]
     frame = 25                      # keys may lie beyond the last frame: a full turn in 24 frames without a double
     env_rotate = 360
 
 Before a value's first key it has that key's value, after its last key that one's. A measured material (a text in `set`)
-holds until the next one of the same material; numbers change it further, whichever stands first.
+holds until the next one of the same material; numbers change it further, whichever stands first. Of a move, translation
+and scale are interpolated linearly and the rotation takes the shorter way at an even pace.
 """
 
 from __future__ import annotations
 
 import itertools
 import tomllib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from relightcli.errors import InputError
 from relightcli.scene.fields import describe, is_number
+from relightcli.scene.moving import COUNTS, between
 from relightcli.scene.settings import measured_fit
 
 MOST_FRAMES = 100_000
@@ -38,7 +42,8 @@ NUMBERS = ("env_rotate", "exposure")
 
 @dataclass(frozen=True)
 class Shot:
-    """One frame. `env` is a path or a name, None for the default; `settings` are texts as `--set` takes them."""
+    """One frame. `env` is a path or a name, None for the default; `settings` and `moves` are
+    texts as `--set` and `--move` take them."""
 
     number: int
     env: str | None
@@ -46,6 +51,7 @@ class Shot:
     camera: str | None
     exposure: float
     settings: tuple[str, ...]
+    moves: tuple[str, ...] = ()
 
 
 def read_shots(path: Path, default: Shot) -> list[Shot]:
@@ -63,7 +69,7 @@ def read_shots(path: Path, default: Shot) -> list[Shot]:
     previous = None
     for i, key in enumerate(keys):
         where = f"key[{i}]"
-        _known(path, where, key, {"frame", "set", *STEPPED, *NUMBERS})
+        _known(path, where, key, {"frame", "set", "move", *STEPPED, *NUMBERS})
         frame = _number(path, f"{where}.frame", key.get("frame"))
         if previous is not None and frame <= previous:
             raise InputError(f"{path}: {where}.frame: expected more than {previous:g}, the key before; found {frame:g}")
@@ -81,6 +87,11 @@ def read_shots(path: Path, default: Shot) -> list[Shot]:
             raise InputError(f"{path}: {where}.set: expected a table; found {changes!r}")
         for name, value in changes.items():
             _add_setting(path, f"{where}.set.{name}", tracks.setdefault(f"set.{name}", []), frame, value)
+        moves = key.get("move", {})
+        if not isinstance(moves, dict):
+            raise InputError(f"{path}: {where}.move: expected a table; found {moves!r}")
+        for name, value in moves.items():
+            _add_move(path, f"{where}.move.{name}", tracks.setdefault(f"move.{name}", []), frame, value)
     return [_shot(path, first + i, tracks, default) for i in range(count)]
 
 
@@ -102,6 +113,15 @@ def _add_setting(path: Path, where: str, track: list[tuple[float, Any]], frame: 
     track.append((frame, numbers))
 
 
+def _add_move(path: Path, where: str, track: list[tuple[float, Any]], frame: float, value: Any) -> None:
+    numbers = tuple(_number(path, where, v) for v in value) if isinstance(value, list) else ()
+    counts = (len(track[0][1]),) if track else COUNTS
+    if len(numbers) not in counts:
+        before = ", as in the key before" if track else ""
+        raise InputError(f"{path}: {where}: expected {' or '.join(map(str, counts))} numbers{before}; found {value!r}")
+    track.append((frame, numbers))
+
+
 def _shot(path: Path, number: int, tracks: dict[str, list[tuple[float, Any]]], default: Shot) -> Shot:
     env = _held(tracks.get("env"), number)
     if env is not None and (path.parent / env).is_file():
@@ -116,6 +136,11 @@ def _shot(path: Path, number: int, tracks: dict[str, list[tuple[float, Any]]], d
         for name, track in changes.items()
         if not _is_text(track)
     ]
+    moves = [
+        f"{name.removeprefix('move.')}={','.join(repr(v) for v in _between(track, number, between) or ())}"
+        for name, track in tracks.items()
+        if name.startswith("move.")
+    ]
     return Shot(
         number,
         env if env is not None else default.env,
@@ -123,6 +148,7 @@ def _shot(path: Path, number: int, tracks: dict[str, list[tuple[float, Any]]], d
         _held(tracks.get("camera"), number) or default.camera,
         exposure[0] if exposure else default.exposure,
         (*default.settings, *names, *numbers),
+        (*default.moves, *moves),
     )
 
 
@@ -137,15 +163,22 @@ def _held(track: list[tuple[float, Any]] | None, number: int) -> str | None:
     return str(past[-1] if past else track[0][1])
 
 
-def _between(track: list[tuple[float, Any]] | None, number: int) -> tuple[float, ...] | None:
+def _linear(low: tuple[float, ...], high: tuple[float, ...], t: float) -> tuple[float, ...]:
+    return tuple((1.0 - t) * x + t * y for x, y in zip(low, high, strict=True))
+
+
+def _between(
+    track: list[tuple[float, Any]] | None,
+    number: int,
+    mix: Callable[[tuple[float, ...], tuple[float, ...], float], tuple[float, ...]] = _linear,
+) -> tuple[float, ...] | None:
     if not track:
         return None
     if number <= track[0][0]:
         return tuple(track[0][1])
     for (a, low), (b, high) in itertools.pairwise(track):
         if a <= number <= b:
-            t = (number - a) / (b - a)
-            return tuple((1.0 - t) * x + t * y for x, y in zip(low, high, strict=True))
+            return mix(low, high, (number - a) / (b - a))
     return tuple(track[-1][1])
 
 

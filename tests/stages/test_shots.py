@@ -1,8 +1,12 @@
 """Keyframe files: interpolation, what holds, and what is refused."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
 from relightcli.errors import InputError
+from relightcli.scene.moving import parse_move
 from relightcli.stages.shots import Shot, read_shots
 
 DEFAULT = Shot(1, "sky", 5.0, "main", -1.0, ("gold.f0=0.5",))
@@ -65,6 +69,19 @@ def test_measured_materials_hold_and_numbers_go_on_top(tmp_path):
     ]
 
 
+def test_moves_are_interpolated_and_follow_those_of_the_command_line(tmp_path):
+    path = tmp_path / "shots.toml"
+    path.write_text(
+        "format = 1\nframes = 3\n"
+        "[[key]]\nframe = 1\nmove = { ball = [0, 0, 0], block = [0, 0, 0, 0, 90, 0] }\n"
+        "[[key]]\nframe = 3\nmove = { ball = [2, 4, 0], block = [0, 0, 1, 0, 0, 0] }\n"
+    )
+    found = read_shots(path, replace(DEFAULT, moves=("lamp=1,1,1",)))
+    assert [s.moves[:2] for s in found] == [("lamp=1,1,1", f"ball={x}.0,{2 * x}.0,0.0") for x in (0, 1, 2)]
+    turned = [parse_move(s.moves[2])[1] for s in found]
+    np.testing.assert_allclose(turned, [(0, 0, 0, 0, 90, 0), (0, 0, 0.5, 0, 45, 0), (0, 0, 1, 0, 0, 0)], atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -98,6 +115,14 @@ def test_measured_materials_hold_and_numbers_go_on_top(tmp_path):
         (
             "frames = 2\n[[key]]\nframe = 1\nset = { a = 1 }\n[[key]]\nframe = 2\nset = { a = [1, 2, 3] }",
             r"key\[1\].set.a: expected 1 numbers",
+        ),
+        ("frames = 2\n[[key]]\nframe = 1\nmove = 3", r"key\[0\].move: expected a table"),
+        ("frames = 2\n[[key]]\nframe = 1\nmove = { a = [1, 2] }", r"key\[0\].move.a: expected 3 or 6 or 16 numbers"),
+        ("frames = 2\n[[key]]\nframe = 1\nmove = { a = [1, 2, inf] }", r"key\[0\].move.a: expected a finite number"),
+        (
+            "frames = 2\n[[key]]\nframe = 1\nmove = { a = [1, 2, 3] }\n"
+            "[[key]]\nframe = 2\nmove = { a = [1, 2, 3, 0, 0, 0] }",
+            r"key\[1\].move.a: expected 3 numbers, as in the key before",
         ),
         ("frames = ", "not a TOML file"),
     ],
