@@ -5,9 +5,9 @@ steps). On a shell it is bilinear over the cube map's texels; over the edge of a
 and at the cube's eight corners the fourth sample is the mean of the three that meet there: the weights are continuous
 everywhere and sum to 1.
 
-Inside the innermost shell its values hold; outside the outermost its difference from empty space falls as the square of
-the distance. Samples inside the object are left out, the others' weights fill up; where all eight are, those further out
-in the same directions stand in.
+Inside the innermost shell its values hold; outside the outermost its difference from empty space falls as the square
+of the distance. Samples inside the object are left out, the others' weights fill up; where all eight are, those further
+out in the same directions stand in.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def locate_one(x, y, z, radii, logarithmic, padded, stand_in, index, weight):  #
     if distance >= radii[last]:
         low, fade = last, (radii[last] / distance) ** 2
     elif distance > radii[0]:
-        low = np.searchsorted(radii, distance, side="right") - 1
+        low = int(np.searchsorted(radii, distance, side="right")) - 1
         if logarithmic:
             along = math.log(distance / radii[low]) / math.log(radii[low + 1] / radii[low])
         else:

@@ -1,7 +1,7 @@
 """Rotation of functions in real spherical harmonics, any order.
 
-The rotated function is f'(d) = f(R^-1 d). Its coefficients D(R) f follow from a quadrature that is exact for products of
-two harmonics of the order,
+The rotated function is f'(d) = f(R^-1 d). Its coefficients D(R) f follow from a quadrature that is exact for products
+of two harmonics of the order,
 
     D_ij = sum over points d_q of w_q y_i(d_q) y_j(R^-1 d_q),
 

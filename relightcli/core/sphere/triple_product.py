@@ -48,27 +48,21 @@ def product_matrices(a: NDArray[np.floating]) -> NDArray[np.float64]:
 
     Their eigenvalues lie between the least and the greatest value of the function.
     """
-    a = np.asarray(a, np.float64)
-    i, j, k, value = coefficients(_order(a))
     n = a.shape[-1]
+    i, j, k, value = coefficients(math.isqrt(n))
     dense = np.zeros((n, n * n))
     dense[i, k * n + j] = value
-    return (a @ dense).reshape(*a.shape[:-1], n, n)
+    out: NDArray[np.float64] = (np.asarray(a, np.float64) @ dense).reshape(*a.shape[:-1], n, n)
+    return out
 
 
 def product(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
     """The cut product (..., N) float64 of functions a and b (..., N), which broadcast."""
-    a, b = np.broadcast_arrays(np.asarray(a, np.float64), np.asarray(b, np.float64))
     n = a.shape[-1]
-    flat = _product(
-        np.ascontiguousarray(a).reshape(-1, n), np.ascontiguousarray(b).reshape(-1, n), *coefficients(_order(a))
-    )
-    found: NDArray[np.float64] = flat.reshape(a.shape)
+    shape = np.broadcast_shapes(a.shape, b.shape)
+    flat_a, flat_b = (np.ascontiguousarray(np.broadcast_to(x, shape), np.float64).reshape(-1, n) for x in (a, b))
+    found: NDArray[np.float64] = _product(flat_a, flat_b, *coefficients(math.isqrt(n))).reshape(shape)
     return found
-
-
-def _order(a: NDArray[np.float64]) -> int:
-    return math.isqrt(a.shape[-1])
 
 
 @njit(cache=True)

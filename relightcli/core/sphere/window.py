@@ -1,4 +1,4 @@
-"""Windows against ringing: the bands of a function scaled so that it is smoothed with a kernel that is nowhere negative.
+"""Windows against ringing: bands scaled as if the function were smoothed with a kernel that is nowhere negative.
 
 A function cut to order n rings: the cut of one between 0 and 1 goes below and above. Scaled by the bands of a kernel
 k(cos) >= 0 of the same order with integral 1 it is a weighted mean of the original, and lies between 0 and 1 again. The
