@@ -17,7 +17,7 @@ from relightcli.cli import options
     "--effects",
     default="auto",
     show_default=True,
-    help="auto, all, or names: direct,shadows,one-bounce,two-bounce,specular.",
+    help="auto, all, or names: direct,shadows,one-bounce,two-bounce,specular,fields.",
 )
 @click.option(
     "--light-resolution", default=64, show_default=True, help="Texels along a face of the sky cube: 16 to 256."
@@ -50,6 +50,29 @@ from relightcli.cli import options
     default=None,
     type=int,
     help="Cells along a cube face through which light bounces: 8, 16 (default) or 32.",
+)
+@click.option("--field-shells", default=16, show_default=True, help="Spheres around what moves on which fields lie.")
+@click.option(
+    "--field-resolution",
+    default=None,
+    type=int,
+    help="Directions along a cube face on every sphere. Default: 16, and 32 for objects with a specular lobe.",
+)
+@click.option("--field-proxies", default=8, show_default=True, help="Points of an object that take its light, at most.")
+@click.option("--field-order", default=4, show_default=True, help="Bands of the spherical harmonics of fields.")
+@click.option(
+    "--field-spacing",
+    type=click.Choice(["geometric", "paper"]),
+    default="geometric",
+    show_default=True,
+    help="Spheres from 1.02 to 8 radii in equal ratios, or from 0.1 to 8 in equal steps.",
+)
+@click.option(
+    "--field-library",
+    default=None,
+    type=options.PATH,
+    metavar="DIR",
+    help="Keep fields as stores of their own in this folder, and take from there what other scenes have made.",
 )
 @click.option("--seed", default=0, type=options.SEED, show_default=True, help="Seed of the random checks.")
 @click.option("--allow-outside", is_flag=True, help="Let the scene file use files outside its folder.")

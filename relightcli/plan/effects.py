@@ -1,8 +1,9 @@
 """Which effects a scene calls for, with the evidence.
 
 Names follow interface.md: direct, shadows, one-bounce, two-bounce, specular, fields, pose. This version does not
-simulate the last two; a scene or a user that needs one is told so. Interreflections are simulated when they are asked
-for, by name or by number. Specular lobes cost nothing here: they are integrated when a picture is made.
+simulate the last; a scene or a user that needs it is told so. Fields are for objects that move. Interreflections are
+simulated when they are asked for, by name or by number. Specular lobes cost nothing here: they are integrated when a
+picture is made.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from relightcli.errors import InputError
 
 KNOWN = ("direct", "shadows", "one-bounce", "two-bounce", "specular", "fields", "pose")
-AVAILABLE = ("direct", "shadows", "one-bounce", "two-bounce", "specular")
+AVAILABLE = ("direct", "shadows", "one-bounce", "two-bounce", "specular", "fields")
 BOUNCES = {"one-bounce": 1, "two-bounce": 2}
 
 
@@ -65,19 +66,29 @@ def bounces_asked(asked: tuple[str, ...] | None, bounces: int | None) -> int:
 
 
 def need_static(motions: dict[str, str], asked: tuple[str, ...] | None) -> None:
-    """Raises InputError where an object moves: its effect (fields, pose) is not simulated by this version.
+    """Raises InputError where an object is skinned: its effect (pose) is not simulated by this version.
 
     Naming the effects (`--effects direct,shadows`) simulates moving objects where the scene file puts them.
     """
     if asked is not None:
         return
     for name, motion in motions.items():
-        if motion != "static":
-            effect = "fields" if motion == "rigid" else "pose"
+        if motion == "skinned":
             raise InputError(
-                f"objects.{name}.motion is {motion!r}: this needs the effect '{effect}', which this version does not "
+                f"objects.{name}.motion is {motion!r}: this needs the effect 'pose', which this version does not "
                 'simulate; use motion = "static", or --effects direct,shadows to keep the object where it stands'
             )
+
+
+def decide_fields(asked: tuple[str, ...] | None, motions: dict[str, str], lights: int) -> Decision:
+    """Fields of rigid objects and `lights` local lights: where there are rigid objects, or when asked for by name."""
+    rigid = [name for name, motion in motions.items() if motion == "rigid"]
+    if asked is not None and "fields" not in asked:
+        return Decision("fields", False, "not asked for: objects stay where they stand")
+    if not rigid and (asked in (None, AVAILABLE) or not lights):
+        return Decision("fields", False, "nothing moves")
+    named = f"{', '.join(rigid) or 'no object'} may be moved"
+    return Decision("fields", True, named + (f", and {lights} local lights" if lights else ""))
 
 
 def decide(
@@ -87,12 +98,14 @@ def decide(
     both_sides: bool,
     lobes: bool,
     bounces: int,
+    moving: bool = False,
 ) -> list[Decision]:
-    """The plan for a static scene: `direct` always, `shadows` unless nothing can block anything, `bounces` with it.
+    """The plan but for fields: `direct` always, `shadows` unless nothing can block anything, `bounces` with it.
 
-    both_sides: any object is lit from both; lobes: any material has a specular lobe, or may get one.
+    both_sides: any object is lit from both; lobes: any material has a specular lobe, or may get one; moving: objects
+    may be moved, and are traced apart.
     """
-    shadows = _shadows(asked, positions, faces, both_sides)
+    shadows = _shadows(asked, positions, faces, both_sides, moving)
     plan = [Decision("direct", True, "always"), shadows]
     for name, number in BOUNCES.items():
         if bounces < number:
@@ -106,8 +119,14 @@ def decide(
 
 
 def _shadows(
-    asked: tuple[str, ...] | None, positions: NDArray[np.float64], faces: NDArray[np.int32], both_sides: bool
+    asked: tuple[str, ...] | None,
+    positions: NDArray[np.float64],
+    faces: NDArray[np.int32],
+    both_sides: bool,
+    moving: bool,
 ) -> Decision:
+    if moving:
+        return Decision("shadows", True, "objects may be moved in front of one another")
     if asked is not None:
         return Decision("shadows", "shadows" in asked, "asked for with --effects")
     if both_sides:

@@ -25,6 +25,17 @@ from relightcli.run import blocks as run
 from relightcli.scene.build import build_geometry, scene_to_json
 from relightcli.scene.model import Geometry, Scene
 from relightcli.scene.parse import load_scene
+from relightcli.stages.fields import (
+    FieldSettings,
+    Moving,
+    add_points,
+    describe,
+    find_movers,
+    place,
+    predict,
+    put_fields,
+    without,
+)
 from relightcli.stages.inputs import scene_inputs
 from relightcli.stages.receiver_setup import (
     MOST_PIXEL_GRID,
@@ -67,12 +78,30 @@ class Config:
     sh_order: int = 6
     bounces: int | None = None
     bounce_resolution: int | None = None
+    field_shells: int = 16
+    field_resolution: int | None = None
+    field_proxies: int = 8
+    field_order: int = 4
+    field_spacing: str = "geometric"
+    field_library: Path | None = None
     seed: int = 0
     workers: int = 1
     overwrite: bool = False
     allow_outside: bool = False
     dry_run: bool = False
     quiet: bool = False
+
+    @property
+    def fields(self) -> FieldSettings:
+        """What fields are to be like."""
+        return FieldSettings(
+            self.field_shells,
+            self.field_resolution,
+            self.field_proxies,
+            self.field_order,
+            self.field_spacing,
+            self.field_library,
+        )
 
 
 def precompute(config: Config) -> dict[str, Any]:
@@ -83,8 +112,9 @@ def precompute(config: Config) -> dict[str, Any]:
     asked = effects.parse_effects(config.effects)
     bounces = effects.bounces_asked(asked, config.bounces)
     scene = load_scene(config.scene, allow_outside=config.allow_outside)
+    motions: dict[str, str] = {o.name: o.motion for o in scene.objects.values()}
     try:
-        effects.need_static({o.name: o.motion for o in scene.objects.values()}, asked)
+        effects.need_static(motions, asked)
     except InputError as error:
         raise InputError(f"{scene.path}: {error}") from None
     geometry = build_geometry(scene)
@@ -92,17 +122,27 @@ def precompute(config: Config) -> dict[str, Any]:
     check_receivers(config.receivers, scene, geometry)
     if bounces:
         _check_bounces(config)
-    plan = effects.decide(asked, geometry.positions, geometry.faces, bool(both.any()), _lobes(scene), bounces)
+    fields = effects.decide_fields(asked, motions, len(scene.lights))
+    plan = effects.decide(
+        asked, geometry.positions, geometry.faces, bool(both.any()), _lobes(scene), bounces, fields.simulate
+    )
+    plan.append(fields)
     simulated = [d.effect for d in plan if d.simulate]
     shadows = "shadows" in simulated
     bounce_cells = 0
     if "one-bounce" in simulated:
         bounce_cells = config.bounce_resolution or (8 if config.light_resolution % 16 else 16)
     source = geometry
+    moving = None
+    if fields.simulate:
+        moving = _moving(config, scene)
     if shadows and config.subdivide and (config.receivers == "vertices" or bounce_cells):
-        geometry = _subdivided(geometry)
+        geometry = _subdivided(geometry, moving)
+    uncut = geometry
+    if moving is not None:
+        geometry = place(moving, geometry)
     if config.dry_run:
-        return _dry_run(config, scene, source, geometry, both, plan, shadows, bounce_cells)
+        return _dry_run(config, scene, source, geometry, both, plan, shadows, bounce_cells, moving, uncut)
     settings = {
         "effects": simulated,
         "light_resolution": config.light_resolution,
@@ -117,6 +157,8 @@ def precompute(config: Config) -> dict[str, Any]:
         settings["pixel_grid"] = config.pixel_grid
     if bounce_cells:
         settings["bounce_resolution"] = bounce_cells
+    if moving is not None:
+        settings["fields"] = config.fields.as_json()
     if config.basis == "haar":
         settings |= {"coefficients": config.coefficients, "tolerance": config.tolerance}
     if config.basis == "sh":
@@ -133,8 +175,12 @@ def precompute(config: Config) -> dict[str, Any]:
         return {"store": str(config.output), "status": "up to date", "notes": list(geometry.notes)}
     with writer:
         resumed = bool(writer.done)
-        receivers, buried = _receivers(config, scene, source, geometry, both, shadows, bool(bounce_cells))
+        receivers, buried, starts = _receivers(
+            config, scene, source, geometry, both, shadows, bool(bounce_cells), moving, uncut
+        )
         points = receivers.points if isinstance(receivers, PixelReceivers) else receivers
+        if moving is not None:
+            writer.set_attrs({"fields": describe(moving, scene, starts)})
         writer.set_attrs(
             {
                 "scene": scene_to_json(scene, geometry),
@@ -161,6 +207,8 @@ def precompute(config: Config) -> dict[str, Any]:
             tuple(scene.lights.values()),
             bounce_cells,
             int(np.count_nonzero(points.vertex < 0)),
+            () if moving is None else tuple(geometry.object_names.index(m.mesh.name) for m in moving.movers),
+            starts,
         )
         create_outputs(writer, job, len(receivers))
         run.run_blocks(
@@ -172,6 +220,8 @@ def precompute(config: Config) -> dict[str, Any]:
             quiet=config.quiet,
         )
         run.close_worker()
+        if moving is not None:
+            put_fields(writer, moving, scene, config.fields, config.workers, config.quiet)
         writer.commit({"seconds": time.perf_counter() - started, "resumed": resumed, "workers": config.workers})
     return _summary(config, started, resumed, geometry)
 
@@ -211,8 +261,17 @@ def _check_bounces(config: Config) -> None:
         )
 
 
-def _subdivided(geometry: Geometry) -> Geometry:
-    finer = tessellate(geometry)
+def _moving(config: Config, scene: Scene) -> Moving:
+    """What may be moved. Raises InputError where receivers or settings do not go with it."""
+    config.fields.check()
+    if config.receivers != "vertices":
+        raise InputError("--receivers: objects that move carry their light at vertices; expected vertices")
+    return find_movers(scene, config.fields, config.subdivide, config.seed)
+
+
+def _subdivided(geometry: Geometry, moving: Moving | None) -> Geometry:
+    movers = () if moving is None else tuple(geometry.object_names.index(m.mesh.name) for m in moving.movers)
+    finer = tessellate(geometry, movers)
     more = len(finer.positions) - len(geometry.positions)
     if more == 0:
         return geometry
@@ -228,22 +287,32 @@ def _receivers(
     both: NDArray[np.bool_],
     shadows: bool,
     bounces: bool,
-) -> tuple[Receivers | PixelReceivers, NDArray[np.bool_] | None]:
-    """The receivers, and which of them are buried, (N,), where there are any on vertices.
+    moving: Moving | None,
+    uncut: Geometry,
+) -> tuple[Receivers | PixelReceivers, NDArray[np.bool_] | None, tuple[int, ...]]:
+    """The receivers; which of them are buried, (N,), where there are any on vertices; and the first receiver of what
+    stays, then of everything that moves. uncut: the geometry before the latter's meshes were put in.
 
     Pixels look at the uncut `source`: they are the same, and lit the same, with and without interreflections.
     """
+    if moving is not None:
+        still = without(moving, geometry)
+        vertices, buried = on_vertices(still, both), np.zeros(0, bool)
+        if shadows and not config.dry_run and len(vertices):
+            vertices, buried = unburied(still, vertices)
+        vertices, starts = add_points(moving, uncut, geometry, vertices)
+        return vertices, np.concatenate([buried, np.zeros(len(vertices) - len(buried), bool)]), starts
     seen = geometry if config.receivers == "vertices" else source
     asked = make_receivers(config.receivers, scene, seen, both, config.pixel_grid, fine=bounces)
     if isinstance(asked, PixelReceivers) and not bounces:
-        return asked, None
+        return asked, None, (0,)
     vertices = on_vertices(geometry, both) if isinstance(asked, PixelReceivers) else asked
     buried = np.zeros(len(vertices), bool)
     if shadows and not config.dry_run:
         vertices, buried = unburied(geometry, vertices)
     if isinstance(asked, PixelReceivers):
-        return with_vertices(asked, vertices), np.concatenate([np.zeros(len(asked), bool), buried])
-    return vertices, buried
+        return with_vertices(asked, vertices), np.concatenate([np.zeros(len(asked), bool), buried]), (0,)
+    return vertices, buried, (0,)
 
 
 def _both_sides(scene: Scene, geometry: Geometry) -> NDArray[np.bool_]:
@@ -304,12 +373,14 @@ def _dry_run(
     plan: list[effects.Decision],
     shadows: bool,
     bounce_cells: int,
+    moving: Moving | None,
+    uncut: Geometry,
 ) -> dict[str, Any]:
-    """The plan with its cost, predicted from a pilot of a few hundred receivers.
+    """The plan with its cost, predicted from a pilot of a few hundred receivers, and of samples of fields.
 
     The bytes are an upper bound: the mesh counts uncompressed, and the pilot's bits compress worse in small groups.
     """
-    receivers, _ = _receivers(config, scene, source, geometry, both, shadows, bool(bounce_cells))
+    receivers, _, _ = _receivers(config, scene, source, geometry, both, shadows, bool(bounce_cells), moving, uncut)
     points = receivers.points if isinstance(receivers, PixelReceivers) else receivers
     rays = seconds = packed = 0.0
     if shadows and len(points):
@@ -338,6 +409,9 @@ def _dry_run(
         rays *= len(points) / pilot
         packed *= len(points) / pilot
         seconds *= len(points) / pilot / max(1, config.workers)
+    if moving is not None:
+        more_rays, more_seconds, more_bytes = predict(moving)
+        rays, seconds, packed = rays + more_rays, seconds + more_seconds / max(1, config.workers), packed + more_bytes
     return {
         "dry_run": True,
         "store": str(config.output),

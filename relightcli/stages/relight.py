@@ -60,6 +60,8 @@ def relight(config: Config) -> dict[str, Any]:
 def open_lighting(path: Path, threads: int) -> LightingStore:
     """The store of any stage that pictures are made from."""
     store = formats.open_store(path)
+    if "fields" in store.attrs:
+        raise InputError(f"{path}: holds fields of what moves; this version makes pictures of it with --reference only")
     if store.kind == "asset":
         from relightcli.stages.asset import AssetStore
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from bisect import bisect_right
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -39,6 +41,8 @@ class VisibilityJob:
     lights: tuple[SphereLight | RectangleLight, ...]
     bounce_cells: int  # cells along a side of the cube of what is seen; 0: no interreflections
     pixels: int = 0  # receivers before the first that is on a vertex
+    movers: tuple[int, ...] = ()  # objects that move: each is alone, and the others are together
+    entities: tuple[int, ...] = (0,)  # the first receiver of the others, then of every mover
 
     def open(self) -> VisibilityWorker:
         return VisibilityWorker(self)
@@ -51,35 +55,28 @@ class VisibilityWorker:
         def array(name: str) -> Any:
             return formats.worker_array(job.partial, name)
 
+        self.array = array
         self.position, self.normal = array("receivers/position"), array("receivers/normal")
-        self.tracer = Tracer(array("mesh/position")[:], array("mesh/face")[:]) if job.shadows else None
+        self.opened: tuple[int, Tracer | None, Surfaces | None] | None = None
         self.out = {name: array(name) for name in _outputs(job)}
         self.lights = pack_lights(job.lights)
-        self.surfaces = _surfaces(array) if job.bounce_cells else None
         self.directions = cube.texel_directions(job.resolution).reshape(-1, 3).astype(np.float32)
         self.solid_angle = cube.solid_angles(job.resolution).reshape(-1).astype(np.float32)
 
     def run(self, block: run.Block) -> run.Info:
         job, rows = self.job, slice(block.start, block.stop)
         position, normal = self.position[rows], self.normal[rows]
-        info: run.Info = {"rays": 0.0, "checked": 0.0, "wrong": 0.0, "inferred": 0.0, "bits": 0.0}
-        start = time.perf_counter()
-        if self.tracer is None:
-            bits = visibility.horizon_bits(normal, job.resolution)
-        else:
-            bits = self._trace(self.tracer, block.start, position, normal, info)
-        if self.lights.number:
-            self.out["lights/bits"][rows], rays = light_bits(self.tracer, self.lights, position, normal)
-            info["rays"] += float(rays)
-        info["trace_seconds"] = time.perf_counter() - start
-        self.out["visibility/bits"][rows] = bits
-        if self.surfaces is not None and self.tracer is not None:
-            start = time.perf_counter()
-            self.out["bounce/hit"][rows], rays = trace_hits(
-                self.tracer, self.surfaces, position, normal, bits, job.bounce_cells, block.start, job.seed
-            )
-            info |= {"bounce_rays": float(rays), "bounce_seconds": time.perf_counter() - start}
-            info["rays"] += float(rays)
+        info: run.Info = {"rays": 0.0, "checked": 0.0, "wrong": 0.0, "inferred": 0.0, "bits": 0.0, "trace_seconds": 0.0}
+        if job.bounce_cells:
+            info |= {"bounce_rays": 0.0, "bounce_seconds": 0.0}
+        found: dict[str, list[NDArray[Any]]] = {"visibility/bits": [], "lights/bits": [], "bounce/hit": []}
+        for entity, first, end in self._parts(block.start, block.stop):
+            part = slice(first - block.start, end - block.start)
+            self._see(entity, first, position[part], normal[part], found, info)
+        for name, pieces in found.items():
+            if pieces:
+                self.out[name][rows] = np.concatenate(pieces)
+        bits = np.concatenate(found["visibility/bits"])
         if job.basis == "sh":
             self.out["direct/sh"][rows] = sh.cosine_transfer(bits, normal, job.sh_order)
         elif job.basis == "haar":
@@ -93,39 +90,69 @@ class VisibilityWorker:
             self.out["direct/dense"][rows] = _dense(bits, normal, self.directions, self.solid_angle)
         return info
 
-    def _trace(
+    def _parts(self, start: int, stop: int) -> list[tuple[int, int, int]]:
+        """(entity, first, past the last receiver) of a block's parts; pixels and vertices apart, as if alone."""
+        cuts = sorted({*self.job.entities, self.job.pixels})
+        ends = [start, *(c for c in cuts if start < c < stop), stop]
+        return [(bisect_right(self.job.entities, a) - 1, a, b) for a, b in pairwise(ends)]
+
+    def _open(self, entity: int) -> tuple[Tracer | None, Surfaces | None]:
+        """Rays over what an entity's receivers can see, and who receives there."""
+        if self.opened is None or self.opened[0] != entity:
+            self.opened = None
+            array, job = self.array, self.job
+            owner = array("mesh/face_object")[:]
+            own = owner == job.movers[entity - 1] if entity else ~np.isin(owner, job.movers)
+            tracer = Tracer(array("mesh/position")[:], array("mesh/face")[:][own]) if job.shadows else None
+            self.opened = entity, tracer, _surfaces(array, own) if job.bounce_cells else None
+        return self.opened[1], self.opened[2]
+
+    def _see(
         self,
-        tracer: Tracer,
+        entity: int,
         first: int,
         position: NDArray[np.float64],
         normal: NDArray[np.float32],
+        found: dict[str, list[NDArray[Any]]],
         info: dict[str, float],
-    ) -> NDArray[np.uint8]:
-        """Visibility bits of the receivers from `first` on; pixels and vertices apart, as if they were alone."""
+    ) -> None:
+        """What the receivers of one entity from `first` on see, appended to the lists of `found`."""
         job = self.job
-        cut = min(max(job.pixels - first, 0), len(position))
-        bits = []
-        for rows in (slice(0, cut), slice(cut, len(position))):
-            if rows.start == rows.stop:
-                continue
-            seed = job.seed + first + rows.start
-            traced = visibility.trace_visibility(tracer, position[rows], normal[rows], job.resolution, job.refine, seed)
-            bits.append(traced.bits)
+        tracer, surfaces = self._open(entity)
+        start = time.perf_counter()
+        if tracer is None:
+            bits = visibility.horizon_bits(normal, job.resolution)
+        else:
+            traced = visibility.trace_visibility(tracer, position, normal, job.resolution, job.refine, job.seed + first)
+            bits = traced.bits
             info["rays"] += float(traced.rays)
             info["checked"] += float(traced.checked)
             info["wrong"] += float(traced.wrong)
             info["inferred"] += float(traced.inferred)
-            info["bits"] += float(3 * job.resolution**2 * len(traced.bits))
-        return bits[0] if len(bits) == 1 else np.concatenate(bits)
+            info["bits"] += float(3 * job.resolution**2 * len(bits))
+        found["visibility/bits"].append(bits)
+        if self.lights.number:
+            lit, rays = light_bits(tracer, self.lights, position, normal)
+            found["lights/bits"].append(lit)
+            info["rays"] += float(rays)
+        info["trace_seconds"] += time.perf_counter() - start
+        if surfaces is not None and tracer is not None:
+            start = time.perf_counter()
+            hits, rays = trace_hits(tracer, surfaces, position, normal, bits, job.bounce_cells, first, job.seed)
+            found["bounce/hit"].append(hits)
+            info["bounce_rays"] += float(rays)
+            info["bounce_seconds"] += time.perf_counter() - start
+            info["rays"] += float(rays)
 
 
-def _surfaces(array: Any) -> Surfaces:
-    """Mesh and receivers of the unfinished store, as `trace_hits` wants them; `array` opens one by name."""
+def _surfaces(array: Any, own: NDArray[np.bool_]) -> Surfaces:
+    """Mesh and receivers of the unfinished store, as `trace_hits` wants them; `array` opens one by name. own (F,): the
+    faces that are traced."""
     position = array("mesh/position")[:]
     front, back = receivers_of_vertices(array("receivers/vertex")[:], array("receivers/side")[:], len(position))
-    two_sided = array("objects/two_sided")[:][array("mesh/face_object")[:]]
+    two_sided = array("objects/two_sided")[:][array("mesh/face_object")[:][own]]
     buried = array("receivers/buried")[:]
-    return Surfaces(position, array("mesh/normal")[:], array("mesh/face")[:], two_sided, front, back, buried)
+    return Surfaces(position, array("mesh/normal")[:], array("mesh/face")[:][own], two_sided, front, back, buried)
 
 
 def _dense(

@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 
 from relightcli.errors import InputError
-from relightcli.plan.effects import AVAILABLE, blocks_nothing, bounces_asked, decide, need_static, parse_effects
+from relightcli.plan.effects import (
+    AVAILABLE,
+    blocks_nothing,
+    bounces_asked,
+    decide,
+    decide_fields,
+    need_static,
+    parse_effects,
+)
 from tests.core.transport.scenes import sphere_grid
 
 BALL, BALL_FACES = (x[0].astype(x[1]) for x in zip(sphere_grid(12, 24), (np.float64, np.int32), strict=True))
@@ -24,7 +32,7 @@ def test_names():
     [
         ("caustics", "expected auto, all or names out of direct, .*; found 'caustics'"),
         ("", "found ''"),
-        ("direct,fields", "'fields' is not simulated by this version"),
+        ("direct,pose", "'pose' is not simulated by this version"),
         ("direct,one-bounce", "'one-bounce' needs 'shadows'"),
         ("direct,shadows,two-bounce", "'two-bounce' needs 'one-bounce'"),
         ("shadows", "'direct' must be among them"),
@@ -35,12 +43,30 @@ def test_names_that_are_refused(text, message):
         parse_effects(text)
 
 
-def test_moving_objects_need_effects_that_are_not_there():
-    need_static({"a": "static"}, None)
-    need_static({"a": "rigid"}, ("direct", "shadows"))
-    for motion, effect in (("rigid", "fields"), ("skinned", "pose")):
-        with pytest.raises(InputError, match=f"objects.b.motion is '{motion}'.*'{effect}'"):
-            need_static({"a": "static", "b": motion}, None)
+def test_skinned_objects_need_an_effect_that_is_not_there():
+    need_static({"a": "static", "b": "rigid"}, None)
+    need_static({"a": "skinned"}, ("direct", "shadows"))
+    with pytest.raises(InputError, match=r"objects.b.motion is 'skinned'.*'pose'"):
+        need_static({"a": "static", "b": "skinned"}, None)
+
+
+@pytest.mark.parametrize(
+    ("effects", "motion", "lights", "simulate", "evidence"),
+    [
+        ("auto", "rigid", 0, True, "b may be moved"),
+        ("auto", "rigid", 2, True, "b may be moved, and 2 local lights"),
+        ("auto", "static", 2, False, "nothing moves"),
+        ("all", "static", 2, False, "nothing moves"),
+        ("all", "rigid", 0, True, "b may be moved"),
+        ("direct,fields", "static", 2, True, "no object may be moved, and 2 local lights"),
+        ("direct,fields", "static", 0, False, "nothing moves"),
+        ("direct,shadows", "rigid", 0, False, "not asked for"),
+    ],
+)
+def test_fields_are_for_what_moves(effects, motion, lights, simulate, evidence):
+    decision = decide_fields(parse_effects(effects), {"a": "static", "b": motion}, lights)
+    assert (decision.simulate, decision.effect) == (simulate, "fields")
+    assert evidence in decision.evidence
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e6])
@@ -136,4 +162,6 @@ def test_decisions_come_with_their_evidence():
     assert shadows(None, both=True).simulate
     assert "both sides" in shadows(None, both=True).evidence
     assert shadows(("direct", "shadows")).simulate
+    moving = {d.effect: d for d in decide(None, BALL, BALL_FACES, False, False, 0, moving=True)}
+    assert moving["shadows"].simulate
     assert not shadows(("direct",), faces=BALL_FACES[:, ::-1]).simulate

@@ -78,6 +78,13 @@ def solve(tracer: Tracer, body: Body, proxies: NDArray[np.float64], tolerance: f
     return Solution(transfer, exits, rays, noise, rounds)
 
 
+def exits_of(body: Body, transfer: NDArray[np.float32]) -> NDArray[np.float32]:
+    """`Solution.exits` of its `transfer`."""
+    received = transfer.transpose(0, 2, 1, 3, 4).reshape(len(transfer), body.order**2, -1)
+    turn = local_rotations(body.normal, body.order) if body.terms > 1 else np.zeros((0, 1, 1))
+    return _exit(body, diffuse_operator(body), turn, np.ascontiguousarray(received))
+
+
 def _exit(
     body: Body, operator: NDArray[np.float64], turn: NDArray[np.float64], received: NDArray[np.float32]
 ) -> NDArray[np.float32]:
