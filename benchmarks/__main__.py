@@ -30,6 +30,7 @@ NAMES = (
     "asset_growth",
     "direct",
     "clusters",
+    "fields",
 )
 PACKAGES = ("relightcli", "numpy", "numba", "zarr", "embreex", "mitsuba", "pyradiance")
 RESULTS = Path("build/bench.json")

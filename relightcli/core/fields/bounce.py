@@ -55,12 +55,12 @@ def settle(
     cuts = np.cumsum([len(p) for p in places])[:-1]
     skip = np.repeat(np.arange(len(entities), dtype=np.int32), [len(p) for p in places])
     lookup = look_up(entities, np.concatenate([np.zeros((0, 3)), *places]), skip, threads)
-    rows = open_rows(entities, lookup, order, windowed)
+    rows = open_rows(entities, lookup, order, windowed, threads)
     lights = [np.zeros((len(p), 3, n), np.float32) for p in places] if start is None else start
     done, change = 0, np.inf
     while True:
         if done or start is not None:
-            put_reflections(rows, entities, lookup, lights, windowed)
+            put_reflections(rows, entities, lookup, lights, windowed, threads)
         now = light_at(lookup, rows, sky, threads)
         before = np.concatenate([np.zeros((0, 3, n), np.float32), *lights])
         largest = float(np.abs(now).max(initial=0.0))

@@ -14,12 +14,13 @@ Entities that give back what they hide, I_e = 1 - V_e, telescope: L_far = 1 give
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from relightcli.core.fields.entities import Entity, Lookup
+from relightcli.core.fields.entities import Entity, Lookup, look_up
 from relightcli.core.shade.gather import in_parts
 from relightcli.core.sphere.triple_product import coefficients
 from relightcli.core.sphere.window import window
@@ -28,7 +29,9 @@ EVEN = math.sqrt(4.0 * math.pi)  # coefficient of y_0 of the function 1
 LANES = 64
 
 
-def open_rows(entities: list[Entity], lookup: Lookup, order: int, windowed: float = 0.0) -> NDArray[np.float32]:
+def open_rows(
+    entities: list[Entity], lookup: Lookup, order: int, windowed: float = 0.0, threads: int = 1
+) -> NDArray[np.float32]:
     """Rows (samples, 4, N) float32 in the world's frame, of the samples that are read: what passes the entity as the
     sample sees it, and the radiance that it sends in three colours. Reflections are still missing.
 
@@ -37,15 +40,18 @@ def open_rows(entities: list[Entity], lookup: Lookup, order: int, windowed: floa
     n = order * order
     rows = np.zeros((len(lookup.sample), 4, n), np.float32)
     rows[:, 0, 0] = EVEN
-    for e, entity in enumerate(entities):
-        part = lookup.part(e)
+
+    def put(e: int) -> None:
+        own, part = entities[e].own, lookup.part(e)
         which = lookup.sample[part]
-        turn = (entity.turn(order) * window(order, windowed)).T.astype(np.float32)
-        if entity.own.occlusion is not None:
-            rows[part, 0] = entity.own.occlusion[which] @ turn
-        if entity.own.radiance is not None:
-            sent = entity.own.radiance[which].transpose(0, 2, 1)
+        turn = (entities[e].turn(order) * window(order, windowed)).T.astype(np.float32)
+        if own.occlusion is not None:
+            rows[part, 0] = own.occlusion[which] @ turn
+        if own.radiance is not None:
+            sent = own.radiance[which].transpose(0, 2, 1)
             rows[part, 1:] = (sent.reshape(-1, n) @ turn).reshape(sent.shape)
+
+    in_parts(lambda a, b: _each(put, a, b), len(entities), threads)
     return rows
 
 
@@ -55,18 +61,45 @@ def put_reflections(
     lookup: Lookup,
     lights: list[NDArray[np.float32]],
     windowed: float = 0.0,
+    threads: int = 1,
 ) -> None:
     """Puts what the entities reflect of lights (m, 3, N), in the world's frame, at each one's proxies into the rows:
     once for every sample, however many points read it. [Pan 2007, Eq. 11]"""
     order = math.isqrt(rows.shape[2])
-    for e, entity in enumerate(entities):
-        if entity.own.transfer is None:
-            continue
-        part = lookup.part(e)
-        turn = entity.turn(order)
-        seen = entity.own.transfer.reflect(lights[e] @ turn.astype(np.float32), lookup.sample[part])
+
+    def put(e: int) -> None:
+        transfer, part = entities[e].own.transfer, lookup.part(e)
+        if transfer is None:
+            return
+        turn = entities[e].turn(order)
+        seen = transfer.reflect(lights[e] @ turn.astype(np.float32), lookup.sample[part])
         back = (turn * window(order, windowed)).T.astype(np.float32)
         rows[part, 1:] = (seen.reshape(-1, order * order) @ back).reshape(seen.shape)
+
+    in_parts(lambda a, b: _each(put, a, b), len(entities), threads)
+
+
+def _each(work: Callable[[int], None], start: int, stop: int) -> None:
+    for e in range(start, stop):
+        work(e)
+
+
+def incident(
+    entities: list[Entity],
+    points: NDArray[np.floating],
+    skip: NDArray[np.int32],
+    sky: NDArray[np.floating],
+    lights: list[NDArray[np.float32]],
+    windowed: float = 0.0,
+    threads: int = 1,
+) -> NDArray[np.float32]:
+    """Light (n, 3, N) float32 at points (n, 3) from a sky (3, N), or one for each point, and from all entities but
+    number skip (n,), with the lights at their proxies (see `bounce.settle`)."""
+    order = math.isqrt(np.shape(sky)[-1])
+    lookup = look_up(entities, points, skip, threads)
+    rows = open_rows(entities, lookup, order, windowed, threads)
+    put_reflections(rows, entities, lookup, lights, windowed, threads)
+    return light_at(lookup, rows, sky, threads)
 
 
 def light_at(

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from relightcli.core.fields.body import clamped_cosine
 from relightcli.core.fields.bounce import CONVERGED, settle
-from relightcli.core.fields.chain import light_at, open_rows, passing, put_reflections
+from relightcli.core.fields.chain import incident, light_at, open_rows, passing, put_reflections
 from relightcli.core.fields.entities import Entity, Surroundings, look_up, of_object
 from relightcli.core.fields.interpolate import make_grid
 from relightcli.core.sphere import sh
@@ -21,11 +21,10 @@ NONE = np.int32(-1)
 def light(entities, points, sky, lights=None, order=4, windowed=0.0, skip=None):
     points = np.asarray(points, float)
     skip = np.full(len(points), NONE) if skip is None else skip
-    lookup = look_up(entities, points, skip)
-    rows = open_rows(entities, lookup, order, windowed)
     if lights is not None:
-        put_reflections(rows, entities, lookup, lights, windowed)
-    return light_at(lookup, rows, sky)
+        return incident(entities, points, skip, sky, lights, windowed)
+    lookup = look_up(entities, points, skip)
+    return light_at(lookup, open_rows(entities, lookup, order, windowed), sky)
 
 
 def crowd(count, spread, seed, field=None):
