@@ -62,10 +62,10 @@ from relightcli.cli import options
 @click.option("--field-order", default=4, show_default=True, help="Bands of the spherical harmonics of fields.")
 @click.option(
     "--field-spacing",
-    type=click.Choice(["geometric", "paper"]),
+    type=click.Choice(["geometric", "paper", "adaptive"]),
     default="geometric",
     show_default=True,
-    help="Spheres from 1.02 to 8 radii in equal ratios, or from 0.1 to 8 in equal steps.",
+    help="Spheres from 1.02 to 8 radii in equal ratios, from 0.1 to 8 in equal steps, or where the field bends.",
 )
 @click.option(
     "--field-library",

@@ -18,6 +18,7 @@ import relight_formats as formats
 from relightcli import __version__
 from relightcli.adapters.gltf import buffer_files
 from relightcli.adapters.rays import Tracer
+from relightcli.core.fields.adaptive import adaptive_radii, least_resolution
 from relightcli.core.fields.body import Body, make_body
 from relightcli.core.fields.build import RAYS, field_samples
 from relightcli.core.fields.field import shell_radii
@@ -33,14 +34,16 @@ from relightcli.stages.field_store import FieldSpec, copy_field, put_body, put_s
 
 KIND = "field"
 DIFFUSE_RESOLUTION, GLOSSY_RESOLUTION = 16, 32  # [Pan 2007, section 6]
-SPACINGS = ("geometric", "paper")
+SPACINGS = ("geometric", "paper", "adaptive")
+DIRECTION_ERROR = 0.05  # relative, that `adaptive` allows between the directions of the innermost sphere
 PILOT_SHELLS, PILOT = 4, 32  # spheres and samples of each that a dry run traces
 NOISE = 0.5  # of the scene's tolerance: what the self transfer's own noise may be
 
 
 @dataclass(frozen=True)
 class FieldSettings:
-    """What `--field-*` says. resolution None: 16, and 32 for objects with a specular lobe."""
+    """What `--field-*` says. resolution None: by measured error where `spacing` is adaptive; else 16, and 32 for
+    objects with a specular lobe."""
 
     shells: int = 16
     resolution: int | None = None
@@ -60,7 +63,7 @@ class FieldSettings:
             if not low <= value <= high:
                 raise InputError(f"--field-{name}: expected {low} to {high}; found {value}")
         if self.spacing not in SPACINGS:
-            raise InputError(f"--field-spacing: expected {' or '.join(SPACINGS)}; found {self.spacing!r}")
+            raise InputError(f"--field-spacing: expected one of {', '.join(SPACINGS)}; found {self.spacing!r}")
 
     def resolution_of(self, glossy: bool) -> int:
         """Directions along a cube face."""
@@ -90,11 +93,12 @@ class Mover:
 
 @dataclass(frozen=True)
 class Distinct:
-    """One field to simulate: its spec, body, mean texture around vertices, proxies, and what it is made from."""
+    """One field to simulate: its spec, body, mean texture around vertices, shells, proxies, what it is made from."""
 
     spec: FieldSpec
     body: Body
     texture: NDArray[np.float32]
+    radii: NDArray[np.float64]
     proxies: NDArray[np.float64]
     settings: dict[str, Any]
     inputs: dict[str, str]
@@ -145,13 +149,14 @@ def find_movers(scene: Scene, settings: FieldSettings, cut: bool, seed: int) -> 
         if key not in known:
             known[key] = len(fields)
             proxies = place_proxies(body.point, settings.proxies, seed)
+            radii, resolution = _samples(body, settings, seed)
             field = FieldSpec(
                 f"fields/{len(fields)}/",
                 material,
                 spec.two_sided,
                 settings.order,
                 settings.shells,
-                settings.resolution_of(body.terms > 1),
+                resolution,
                 len(proxies),
                 body.colours,
                 len(body.point),
@@ -159,9 +164,21 @@ def find_movers(scene: Scene, settings: FieldSettings, cut: bool, seed: int) -> 
                 NOISE * scene.tolerance,
                 seed,
             )
-            fields.append(Distinct(field, body, texture, proxies, made, inputs))
+            fields.append(Distinct(field, body, texture, radii, proxies, made, inputs))
         movers.append(Mover(mesh, body, known[key]))
     return Moving(tuple(movers), tuple(fields))
+
+
+def _samples(body: Body, settings: FieldSettings, seed: int) -> tuple[NDArray[np.float64], int]:
+    """Radii of the shells, and directions along a cube face."""
+    resolution = settings.resolution_of(body.terms > 1)
+    if settings.spacing != "adaptive":
+        return shell_radii(body.radius, settings.shells, settings.spacing), resolution
+    tracer = Tracer(body.positions, body.faces)
+    radii = adaptive_radii(tracer, body, settings.shells, seed)
+    if settings.resolution is None:
+        resolution = least_resolution(tracer, body, float(radii[0]), DIRECTION_ERROR, seed)
+    return radii, resolution
 
 
 def place(moving: Moving, geometry: Geometry) -> Geometry:
@@ -226,14 +243,15 @@ def put_fields(
     """Simulates every field into the store, or takes it from the library, where it is simulated if it is not there."""
     if settings.library is None:
         for field in moving.fields:
-            _put_body(writer, field, settings)
+            _put_body(writer, field)
         simulate(writer, [field.spec for field in moving.fields], workers, quiet)
     else:
         settings.library.mkdir(parents=True, exist_ok=True)
         for field in moving.fields:
             copy_field(_from_library(field, settings, workers, quiet), writer, field.spec.prefix)
+    spacing = "geometric" if settings.spacing == "adaptive" else settings.spacing
     for j, light in enumerate(scene.lights.values()):
-        source = source_field(light, settings.shells, settings.resolution_of(False), settings.order, settings.spacing)
+        source = source_field(light, settings.shells, settings.resolution_of(False), settings.order, spacing)
         put_source(writer, f"sources/{j}/", source)
 
 
@@ -245,13 +263,12 @@ def predict(moving: Moving) -> tuple[float, float, float]:
         tracer = Tracer(body.positions, body.faces)
         lights = spec.proxies * spec.order**2 * spec.colours
         dark = np.zeros((spec.points, body.terms, lights), np.float32)
-        radii = shell_radii(body.radius, spec.shells)
         for _ in range(2):  # the first run pays for compilation
             clock = time.perf_counter()
             for shell in np.linspace(0, spec.shells - 1, PILOT_SHELLS).astype(int):
                 start = int(shell) * spec.cells
                 field_samples(
-                    tracer, body, dark, radii, spec.resolution, start, start + min(PILOT, spec.cells), spec.rays
+                    tracer, body, dark, field.radii, spec.resolution, start, start + min(PILOT, spec.cells), spec.rays
                 )
             taken = time.perf_counter() - clock
         samples = spec.shells * spec.cells
@@ -276,12 +293,11 @@ def _from_library(field: Distinct, settings: FieldSettings, workers: int, quiet:
     if writer is not None:
         with writer:
             alone = replace(field, spec=replace(field.spec, prefix=""))
-            _put_body(writer, alone, settings)
+            _put_body(writer, alone)
             simulate(writer, [alone.spec], workers, quiet)
             writer.commit({})
     return formats.open_store(path, KIND)
 
 
-def _put_body(writer: formats.Writer, field: Distinct, settings: FieldSettings) -> None:
-    radii = shell_radii(field.body.radius, settings.shells, settings.spacing)
-    put_body(writer, field.spec, field.body, field.texture, radii, field.proxies)
+def _put_body(writer: formats.Writer, field: Distinct) -> None:
+    put_body(writer, field.spec, field.body, field.texture, field.radii, field.proxies)
