@@ -9,8 +9,8 @@ E_hj L for the light at the proxies, once for all samples of a cluster, then the
 
 The clusters are found in the leading coordinates of one common basis that leaves less than a tenth of the tolerance:
 distances stay nearly what they are, and D (2,000 and more) falls to hundreds. Terms are given out where they pay most
-for their bytes, until the tolerance is met. Components and coefficients are 16-bit integers with a scale for each
-component.
+for their bytes, until the tolerance is met. Components are 8-bit integers with a scale for each; those whose rounding
+would show have a second 8 bits, of what the first leave. Coefficients are 16-bit integers.
 """
 
 from __future__ import annotations
@@ -29,7 +29,9 @@ CLUSTERS = 32
 TERMS = 16
 MOST_COMMON = 384  # directions of the common basis
 MOST_TOLD_APART = 64  # leading ones of them that clusters are found by
-_STEPS = 32767
+_STEPS, _COEFFICIENT_STEPS = 127, 32767
+_FINER = np.float32(254.0)  # half a step is 127 of these
+_ROUNDING = 0.1  # share of the error that rounding may have, in squares
 _FLOOR = 1e-4  # of the norm: far below what a few bits of components leave
 
 
@@ -39,7 +41,8 @@ class CompressedTransfer:
 
     shape m, N, N, C of a sample; cluster (samples,) uint8 or int32
     start (K + 1,) int32: components of cluster h are start[h] to start[h + 1], the mean first
-    component (E, m N N C) int16 and its scale (E,) float32
+    component (E, m N N C) int8 and its scale (E,) float32; finer (G, m N N C) int8 in steps of 1/254 of the scale, to
+    be added to the components refined (G,) int32
     first (samples + 1,) int64: a sample's coefficients, all but the mean's, in coefficient (A,) int16; their scale is
     that of the component, coefficient_scale (E,) float32
     error: |M - M~| / |M|, Frobenius, over all samples, quantisation included
@@ -48,8 +51,10 @@ class CompressedTransfer:
     shape: tuple[int, int, int, int]
     cluster: NDArray[np.int32]
     start: NDArray[np.int32]
-    component: NDArray[np.int16]
+    component: NDArray[np.int8]
     scale: NDArray[np.float32]
+    finer: NDArray[np.int8]
+    refined: NDArray[np.int32]
     first: NDArray[np.int64]
     coefficient: NDArray[np.int16]
     coefficient_scale: NDArray[np.float32]
@@ -58,7 +63,15 @@ class CompressedTransfer:
     @property
     def nbytes(self) -> int:
         """Bytes kept: a cluster's number takes one, the places of coefficients follow from it."""
-        arrays = self.start, self.component, self.scale, self.coefficient, self.coefficient_scale
+        arrays = (
+            self.start,
+            self.component,
+            self.scale,
+            self.finer,
+            self.refined,
+            self.coefficient,
+            self.coefficient_scale,
+        )
         return sum(a.nbytes for a in arrays) + len(self.cluster)
 
     def reflect(self, light: NDArray[np.floating], which: NDArray[np.integer]) -> NDArray[np.float32]:
@@ -68,7 +81,11 @@ class CompressedTransfer:
         rows = np.flatnonzero(np.repeat(used, np.diff(self.start)))
         # (m, N in, C) against (E, m, N out, N in, C), by the components of clusters that are read alone
         seen = np.zeros((len(self.component), 3, n), np.float32)
-        _apply(self.component.reshape(-1, m, n, n, colours), self.scale, light.astype(np.float32), rows, seen)
+        light = np.ascontiguousarray(light, np.float32)
+        shape = m, n, n, colours
+        _apply(self.component.reshape(-1, *shape), self.scale, light, rows, rows, seen)
+        fine = np.flatnonzero(np.isin(self.refined, rows))
+        _apply(self.finer.reshape(-1, *shape), self.scale / _FINER, light, fine, self.refined[fine], seen)
         out = np.empty((len(which), 3, n), np.float32)
         _combine(
             which, self.cluster, self.start, self.first, self.coefficient, self.coefficient_scale,
@@ -83,6 +100,8 @@ class CompressedTransfer:
             own = np.flatnonzero(self.cluster == h)
             a, b = self.start[h], self.start[h + 1]
             basis = self.component[a:b] * self.scale[a:b, None]
+            fine = np.flatnonzero((self.refined >= a) & (self.refined < b))
+            basis[self.refined[fine] - a] += self.finer[fine] * (self.scale[self.refined[fine], None] / _FINER)
             places = self.first[own, None] + np.arange(b - a - 1)
             alpha = self.coefficient[places] * self.coefficient_scale[a + 1 : b]
             rows[own] = basis[0] + alpha @ basis[1:]
@@ -124,22 +143,33 @@ def compress(
     kept = [min(terms - 1, len(g)) for g in gains]
     if tolerance is not None:
         sizes = np.bincount(label)
-        bytes_ = [2.0 * rows.shape[1] + 8.0 + 2.0 * size for size in sizes]
-        kept = _share_out(gains, bytes_, goal2 - left2)
+        bytes_ = [rows.shape[1] + 8.0 + 2.0 * size for size in sizes]
+        kept = _share_out(gains, bytes_, (1.0 - _ROUNDING) * goal2 - left2)
     start = np.zeros(count + 1, np.int32)
     start[1:] = np.cumsum(np.array(kept) + 1)
     alpha = [(x[label == h] - means[h]) @ vectors[h][:, : kept[h]] for h in range(count)]
     first = np.concatenate([[0], np.cumsum(np.array(kept)[label])]).astype(np.int64)
-    component = np.empty((start[-1], rows.shape[1]), np.int16)
+    component = np.empty((start[-1], rows.shape[1]), np.int8)
     scale, coefficient_scale = np.empty(start[-1], np.float32), np.ones(start[-1], np.float32)
     coefficient = np.empty(first[-1], np.int16)
+    rest = np.empty((start[-1], rows.shape[1]), np.float32)  # what 8 bits leave of a component, in steps
+    shown = np.empty(start[-1])  # its square sum in all samples
     for h in range(count):
         a, b = start[h], start[h + 1]
         full = np.concatenate([(origin + basis @ means[h])[None], (basis @ vectors[h][:, : kept[h]]).T])
-        component[a:b], scale[a:b] = _quantise(full)
-        integers, coefficient_scale[a + 1 : b] = _quantise(alpha[h].T)
+        integers, scale[a:b] = _quantise(full, _STEPS)
+        component[a:b] = integers
+        rest[a:b] = full / np.where(scale[a:b] > 0.0, scale[a:b], 1.0)[:, None] - integers
+        weight = np.concatenate([[float((label == h).sum())], gains[h][: kept[h]]])
+        shown[a:b] = weight * (rest[a:b] ** 2).sum(1) * scale[a:b].astype(np.float64) ** 2
+        integers, coefficient_scale[a + 1 : b] = _quantise(alpha[h].T, _COEFFICIENT_STEPS)
         coefficient[first[:-1][label == h, None] + np.arange(kept[h])] = integers.T
-    made = CompressedTransfer(shape, label, start, component, scale, first, coefficient, coefficient_scale, 0.0)
+    left = left2 + sum(float(g[k:].sum()) for g, k in zip(gains, kept, strict=True))
+    refined = _worst(shown, _ROUNDING * (left if tolerance is None else goal2))
+    finer = np.clip(np.rint(rest[refined] * _FINER), -_STEPS, _STEPS).astype(np.int8)
+    made = CompressedTransfer(
+        shape, label, start, component, scale, finer, refined, first, coefficient, coefficient_scale, 0.0
+    )
     missing = made.decompress().reshape(rows.shape) - rows
     error2 = float(np.einsum("ij,ij->", missing, missing, dtype=np.float64))
     return CompressedTransfer(**{**made.__dict__, "error": (error2 / norm2) ** 0.5 if norm2 > 0.0 else 0.0})
@@ -188,18 +218,26 @@ def _share_out(gains: list[NDArray[np.float64]], bytes_: list[float], allowed: f
     return np.bincount(owner[best[:enough]], minlength=len(gains)).tolist()
 
 
-def _quantise(rows: NDArray[np.float64]) -> tuple[NDArray[np.int16], NDArray[np.float32]]:
-    """Integers (n, D) and scales (n,) of rows."""
-    scale = (np.abs(rows).max(1, initial=0.0) / _STEPS).astype(np.float32)
+def _worst(shown: NDArray[np.float64], allowed: float) -> NDArray[np.int32]:
+    """The fewest components, rising, without which the sum of `shown` is within what is allowed."""
+    order = np.argsort(-shown, kind="stable")
+    left = shown.sum() - np.concatenate([[0.0], np.cumsum(shown[order])])
+    return np.sort(order[: int((left > allowed).sum())]).astype(np.int32)
+
+
+def _quantise(rows: NDArray[np.float64], most: int) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Whole numbers (n, D) from -most to most, and scales (n,), of rows."""
+    scale = (np.abs(rows).max(1, initial=0.0) / most).astype(np.float32)
     steps = np.where(scale > 0.0, scale, 1.0).astype(np.float64)
-    return np.clip(np.rint(rows / steps[:, None]), -_STEPS, _STEPS).astype(np.int16), scale
+    return np.clip(np.rint(rows / steps[:, None]), -most, most), scale
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
-def _apply(component, scale, light, rows, out):  # type: ignore[no-untyped-def]
-    """E L of the given components (E, m, N, N, C): out (E, 3, N)."""
+def _apply(component, scale, light, rows, at, out):  # type: ignore[no-untyped-def]
+    """Adds E L of components rows[r] (of (E, m, N, N, C)), of scale at[r], to out[at[r]] (3, N)."""
     colours = component.shape[4]
-    for e in rows:
+    for r in range(len(rows)):
+        e, to = rows[r], at[r]
         for k in range(component.shape[1]):
             for i in range(component.shape[2]):
                 for c in range(3):
@@ -210,7 +248,7 @@ def _apply(component, scale, light, rows, out):  # type: ignore[no-untyped-def]
                     else:
                         for j in range(component.shape[3]):
                             total += component[e, k, i, j, c] * light[k, c, j]
-                    out[e, c, i] += scale[e] * total
+                    out[to, c, i] += scale[to] * total
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})

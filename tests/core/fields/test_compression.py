@@ -26,7 +26,7 @@ def test_tolerance_is_kept_and_not_wasted(tolerance):
     values = transfer()
     made = compress(values, 4, tolerance=tolerance)
     assert made.error == pytest.approx(error(made, values), rel=1e-3)
-    # 1 % of leeway: what the common basis leaves is counted, the steps of 16 bits are not.
+    # 1 % of leeway: the rounding of coefficients is not counted.
     assert made.error <= 1.01 * tolerance
     assert made.error > 0.5 * tolerance
 
@@ -40,7 +40,8 @@ def test_error_falls_and_bytes_grow_with_terms():
     assert [len(m.component) for m in made] == [4, 8, 16, 32, 64]
     assert errors[-1] < errors[0] / 3
     m = made[2]
-    assert sizes[2] == m.component.nbytes + m.coefficient.nbytes + 8 * 16 + 4 * 5 + len(values)
+    bodies = m.component.nbytes + m.finer.nbytes + m.coefficient.nbytes
+    assert sizes[2] == bodies + 4 * len(m.refined) + 8 * 16 + 4 * 5 + len(values)
 
 
 def test_clusters_help_at_equal_terms():
@@ -70,7 +71,7 @@ def test_plain_transfer_is_the_sum_over_proxies():
 
 def test_same_bytes_again():
     a, b = compress(transfer(), 4, terms=3), compress(transfer(), 4, terms=3)
-    for name in ("cluster", "component", "scale", "coefficient", "coefficient_scale"):
+    for name in ("cluster", "component", "scale", "finer", "refined", "coefficient", "coefficient_scale"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
