@@ -31,6 +31,7 @@ NAMES = (
     "direct",
     "clusters",
     "pose",
+    "fields",
 )
 PACKAGES = ("relightcli", "numpy", "numba", "zarr", "embreex", "mitsuba", "pyradiance")
 RESULTS = Path("build/bench.json")

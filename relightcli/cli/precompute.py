@@ -17,7 +17,7 @@ from relightcli.cli import options
     "--effects",
     default="auto",
     show_default=True,
-    help="auto, all, or names: direct,shadows,one-bounce,two-bounce,specular,pose.",
+    help="auto, all, or names: direct,shadows,one-bounce,two-bounce,specular,fields,pose.",
 )
 @click.option(
     "--light-resolution",
@@ -73,6 +73,29 @@ from relightcli.cli import options
     "--pose-surroundings/--no-pose-surroundings",
     default=False,
     help="Let other objects block posed vertices, where the clips take them. Default: their own body alone.",
+)
+@click.option("--field-shells", default=16, show_default=True, help="Spheres around what moves on which fields lie.")
+@click.option(
+    "--field-resolution",
+    default=None,
+    type=int,
+    help="Directions along a cube face on every sphere. Default: 16, and 32 for objects with a specular lobe.",
+)
+@click.option("--field-proxies", default=8, show_default=True, help="Points of an object that take its light, at most.")
+@click.option("--field-order", default=4, show_default=True, help="Bands of the spherical harmonics of fields.")
+@click.option(
+    "--field-spacing",
+    type=click.Choice(["geometric", "paper", "adaptive"]),
+    default="geometric",
+    show_default=True,
+    help="Spheres from 1.02 to 8 radii in equal ratios, from 0.1 to 8 in equal steps, or where the field bends.",
+)
+@click.option(
+    "--field-library",
+    default=None,
+    type=options.PATH,
+    metavar="DIR",
+    help="Keep fields as stores of their own in this folder, and take from there what other scenes have made.",
 )
 @click.option("--seed", default=0, type=options.SEED, show_default=True, help="Seed of the random checks.")
 @click.option("--allow-outside", is_flag=True, help="Let the scene file use files outside its folder.")

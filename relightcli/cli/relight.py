@@ -35,6 +35,13 @@ from relightcli.cli import options
     metavar="OBJECT=CLIP@SECONDS",
     help="Pose a skinned object as one of its clips does at a time.",
 )
+@click.option(
+    "--move",
+    "moves",
+    multiple=True,
+    metavar="NAME=NUMBERS",
+    help="Put a rigid object or a local light elsewhere: x,y,z; six numbers turn it too; sixteen are its matrix.",
+)
 @click.option("--frames", default=None, type=options.PATH, help="Keyframes (TOML); output name with ####.")
 @click.option("--layers", is_flag=True, help="Write the parts of the picture as EXR layers.")
 @click.option(

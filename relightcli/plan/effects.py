@@ -1,7 +1,7 @@
 """Which effects a scene calls for, with the evidence.
 
 Names follow interface.md: direct, shadows, one-bounce, two-bounce, specular, fields, pose. This version does not
-simulate fields; a scene or a user that needs them is told so. Left to itself (`auto`) the plan asks structure
+Left to itself (`auto`) the plan asks structure
 first (nothing can block anything), then a pilot (`plan.pilot`): an effect is skipped where leaving it out costs less
 than SKIPPED of the tolerance. Specular lobes cost nothing here: they are integrated when a picture is made.
 """
@@ -19,7 +19,7 @@ from relightcli.errors import InputError
 from relightcli.plan.pilot import Share
 
 KNOWN = ("direct", "shadows", "one-bounce", "two-bounce", "specular", "fields", "pose")
-AVAILABLE = ("direct", "shadows", "one-bounce", "two-bounce", "specular", "pose")
+AVAILABLE = ("direct", "shadows", "one-bounce", "two-bounce", "specular", "fields", "pose")
 BOUNCES = {"one-bounce": 1, "two-bounce": 2}
 SKIPPED = 0.5  # of the tolerance: what effects that are left out may cost together
 COARSE_ERROR = 0.06  # of interreflections through cells of 11 degrees, where those of 2.8 degrees are taken for true
@@ -83,19 +83,15 @@ def bounces_asked(asked: tuple[str, ...] | None, bounces: int | None) -> int | N
     return bounces
 
 
-def need_static(motions: dict[str, str], asked: tuple[str, ...] | None) -> None:
-    """Raises InputError where an object moves as a whole: that needs fields, which this version does not simulate.
-
-    Naming the effects (`--effects direct,shadows`) simulates moving objects where the scene file puts them.
-    """
-    if asked is not None:
-        return
-    for name, motion in motions.items():
-        if motion == "rigid":
-            raise InputError(
-                f"objects.{name}.motion is {motion!r}: this needs the effect 'fields', which this version does not "
-                'simulate; use motion = "static", or --effects direct,shadows to keep the object where it stands'
-            )
+def decide_fields(asked: tuple[str, ...] | None, motions: dict[str, str], lights: int) -> Decision:
+    """Fields of rigid objects and `lights` local lights: where there are rigid objects, or when asked for by name."""
+    rigid = [name for name, motion in motions.items() if motion == "rigid"]
+    if asked is not None and "fields" not in asked:
+        return Decision("fields", False, "not asked for: objects stay where they stand")
+    if not rigid and (asked in (None, AVAILABLE) or not lights):
+        return Decision("fields", False, "nothing moves")
+    named = f"{', '.join(rigid) or 'no object'} may be moved"
+    return Decision("fields", True, named + (f", and {lights} local lights" if lights else ""))
 
 
 def decide(
@@ -107,13 +103,15 @@ def decide(
     bounces: int | None,
     tolerance: float,
     pilot: Callable[[], Pilot],
+    moving: bool = False,
 ) -> tuple[list[Decision], int]:
-    """The plan for a static scene, and how many interreflections it has.
+    """The plan but for what moves, and how many interreflections it has.
 
     both_sides: any object is lit from both; lobes: any material has a specular lobe, or may get one; bounces: None
-    leaves their number to the plan; tolerance: relative RMS; pilot: makes the measurements, called only if needed.
+    leaves their number to the plan; tolerance: relative RMS; pilot: makes the measurements, called only if
+    needed; moving: objects may be moved, and are traced apart.
     """
-    shadows = _shadows(asked, positions, faces, both_sides)
+    shadows = _shadows(asked, positions, faces, both_sides, moving)
     allowed = SKIPPED * tolerance
     rows = [Decision(name, False, "not asked for") for name in BOUNCES]
     if not shadows.simulate:
@@ -129,7 +127,7 @@ def decide(
         tails = measure.tails(allowed)
         bounces = bounces_needed(tails, allowed)
         rows = [_bounce(name, number, tails, bounces, allowed) for name, number in BOUNCES.items()]
-        if bounces == 0 and not both_sides:
+        if bounces == 0 and not both_sides and not moving:
             lost = measure.shadows()
             shadows = Decision("shadows", lost.bound > allowed, _text(lost, allowed), lost.share, lost.bound)
     assert bounces is not None
@@ -188,8 +186,14 @@ def decide_pose(asked: tuple[str, ...] | None, clips: dict[str, int]) -> Decisio
 
 
 def _shadows(
-    asked: tuple[str, ...] | None, positions: NDArray[np.float64], faces: NDArray[np.int32], both_sides: bool
+    asked: tuple[str, ...] | None,
+    positions: NDArray[np.float64],
+    faces: NDArray[np.int32],
+    both_sides: bool,
+    moving: bool,
 ) -> Decision:
+    if moving:
+        return Decision("shadows", True, "objects may be moved in front of one another")
     if asked is not None:
         return Decision("shadows", "shadows" in asked, "asked for with --effects")
     if both_sides:

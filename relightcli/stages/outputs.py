@@ -15,6 +15,7 @@ from relightcli.adapters import images
 from relightcli.adapters.files import need_output
 from relightcli.errors import InputError
 from relightcli.scene.model import Camera, Geometry, Scene
+from relightcli.scene.moving import apply_moves
 from relightcli.scene.posing import resolve_poses
 from relightcli.scene.settings import apply_settings
 from relightcli.stages.shots import Shot
@@ -34,6 +35,7 @@ class Config:
     camera: str | None = None
     settings: tuple[str, ...] = ()
     poses: tuple[str, ...] = ()
+    moves: tuple[str, ...] = ()
     frames: Path | None = None
     previous: Path | None = None
     layers: bool = False
@@ -87,6 +89,7 @@ def check_shots(config: Config, shots: list[Shot], scene: Scene) -> None:
     for shot in shots:
         try:
             apply_settings(scene.materials, shot.settings)
+            apply_moves(scene, shot.moves)
             resolve_environment(shot.env, scene.environments)
             if shot.camera is not None:
                 resolve_camera(shot.camera, scene.cameras)

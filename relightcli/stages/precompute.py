@@ -27,6 +27,17 @@ from relightcli.run import blocks as run
 from relightcli.scene.build import build_geometry, scene_to_json
 from relightcli.scene.model import Geometry, Scene
 from relightcli.scene.parse import load_scene
+from relightcli.stages.fields import (
+    FieldSettings,
+    Moving,
+    add_points,
+    describe,
+    find_movers,
+    place,
+    predict,
+    put_fields,
+    without,
+)
 from relightcli.stages.inputs import scene_inputs
 from relightcli.stages.pose_job import check_pose_options, choose_frames, simulate_poses
 from relightcli.stages.promise import keep_promise, try_resolutions
@@ -47,6 +58,7 @@ from relightcli.stages.rig_store import put_rigs
 from relightcli.stages.visibility_job import VisibilityJob, block_size, create_outputs
 
 KIND = "transfer"
+MOVING = ("fields", "pose")  # effects
 BASES = ("visibility", "haar", "sh", "dense")
 RESOLUTION = 64  # texels along a face of the light's cube, unless asked for or chosen
 PILOT_GROUPS = 24  # groups of receivers that a dry run traces
@@ -78,12 +90,30 @@ class Config:
     pose_order: int = 4
     pose_directions: int = 1024
     pose_surroundings: bool = False
+    field_shells: int = 16
+    field_resolution: int | None = None
+    field_proxies: int = 8
+    field_order: int = 4
+    field_spacing: str = "geometric"
+    field_library: Path | None = None
     seed: int = 0
     workers: int = 1
     overwrite: bool = False
     allow_outside: bool = False
     dry_run: bool = False
     quiet: bool = False
+
+    @property
+    def fields(self) -> FieldSettings:
+        """What fields are to be like."""
+        return FieldSettings(
+            self.field_shells,
+            self.field_resolution,
+            self.field_proxies,
+            self.field_order,
+            self.field_spacing,
+            self.field_library,
+        )
 
 
 def precompute(config: Config) -> dict[str, Any]:
@@ -95,16 +125,14 @@ def precompute(config: Config) -> dict[str, Any]:
     wanted = effects.bounces_asked(asked, config.bounces)
     promise = config.tolerance if config.basis == "visibility" else None
     scene = load_scene(config.scene, allow_outside=config.allow_outside)
-    try:
-        effects.need_static({o.name: o.motion for o in scene.objects.values()}, asked)
-    except InputError as error:
-        raise InputError(f"{scene.path}: {error}") from None
+    motions: dict[str, str] = {o.name: o.motion for o in scene.objects.values()}
     geometry = build_geometry(scene)
     both = _both_sides(scene, geometry)
     check_receivers(config.receivers, scene, geometry)
     if wanted:
         _check_bounces(config)
     clock = time.perf_counter()
+    fields = effects.decide_fields(asked, motions, len(scene.lights))
     plan, bounces = effects.decide(
         asked,
         geometry.positions,
@@ -114,16 +142,18 @@ def precompute(config: Config) -> dict[str, Any]:
         wanted,
         scene.tolerance if promise is None else promise,
         lambda: _Pilot(scene, geometry),
+        fields.simulate,
     )
     planning = time.perf_counter() - clock
     if bounces:
         _check_bounces(config)
     plan.append(effects.decide_pose(asked, {name: len(rig.clips) for name, rig in geometry.rigs.items()}))
+    plan.append(fields)
     simulated = [d.effect for d in plan if d.simulate]
-    if promise is not None and "pose" in simulated:
+    if promise is not None and any(name in simulated for name in MOVING):
         raise InputError(
-            f"--tolerance: {scene.path} has skinned objects, and no error is promised for the light about what moves; "
-            "leave it out, or name effects without pose"
+            f"--tolerance: {scene.path} has objects that move, and no error is promised for the light about them; "
+            "leave it out, or name effects without fields and pose"
         )
     shadows = "shadows" in simulated
     bounce_cells = 0
@@ -132,17 +162,37 @@ def precompute(config: Config) -> dict[str, Any]:
         planned = 8 if coarse else effects.bounce_cells(plan, promise or scene.tolerance)
         bounce_cells = config.bounce_resolution or planned
     source = geometry
+    moving = None
+    if fields.simulate:
+        moving = _moving(config, scene)
     if shadows and config.subdivide and (config.receivers == "vertices" or bounce_cells):
-        geometry = _subdivided(geometry)
+        geometry = _subdivided(geometry, moving)
+    uncut = geometry
+    if moving is not None:
+        geometry = place(moving, geometry)
     tried: list[tuple[int, pilot.Share]] = []
     resolution = config.light_resolution or RESOLUTION
     if config.light_resolution is None and promise is not None and shadows:
-        receivers, buried = _receivers(config, scene, source, geometry, both, plan, bool(bounce_cells))
+        receivers, buried, _ = _receivers(
+            config, scene, source, geometry, both, plan, bool(bounce_cells), moving, uncut
+        )
         tried = try_resolutions(config, scene, source, geometry, receivers, buried, promise)
         resolution = tried[-1][0]
     if config.dry_run:
         return _dry_run(
-            config, resolution, scene, source, geometry, both, plan, bounces, planning, shadows, bounce_cells
+            config,
+            resolution,
+            scene,
+            source,
+            geometry,
+            both,
+            plan,
+            bounces,
+            planning,
+            shadows,
+            bounce_cells,
+            moving,
+            uncut,
         )
     settings: dict[str, Any] = {
         "effects": simulated,
@@ -158,6 +208,8 @@ def precompute(config: Config) -> dict[str, Any]:
         settings["pixel_grid"] = config.pixel_grid
     if bounce_cells:
         settings["bounce_resolution"] = bounce_cells
+    if moving is not None:
+        settings["fields"] = config.fields.as_json()
     if config.basis == "haar":
         settings |= {"coefficients": config.coefficients, "tolerance": config.tolerance}
     if "pose" in simulated:
@@ -181,8 +233,12 @@ def precompute(config: Config) -> dict[str, Any]:
         return {"store": str(config.output), "status": "up to date", "notes": list(geometry.notes)}
     with writer:
         resumed = bool(writer.done)
-        receivers, buried = _receivers(config, scene, source, geometry, both, plan, bool(bounce_cells))
+        receivers, buried, starts = _receivers(
+            config, scene, source, geometry, both, plan, bool(bounce_cells), moving, uncut
+        )
         points = receivers.points if isinstance(receivers, PixelReceivers) else receivers
+        if moving is not None:
+            writer.set_attrs({"fields": describe(moving, scene, starts)})
         writer.set_attrs(
             {
                 "scene": scene_to_json(scene, geometry),
@@ -212,6 +268,8 @@ def precompute(config: Config) -> dict[str, Any]:
             tuple(scene.lights.values()),
             bounce_cells,
             int(np.count_nonzero(points.vertex < 0)),
+            () if moving is None else tuple(geometry.object_names.index(m.mesh.name) for m in moving.movers),
+            starts,
             _posed(geometry, plan),
         )
         create_outputs(writer, job, len(receivers))
@@ -224,6 +282,8 @@ def precompute(config: Config) -> dict[str, Any]:
             quiet=config.quiet,
         )
         run.close_worker()
+        if moving is not None:
+            put_fields(writer, moving, scene, config.fields, config.workers, config.quiet)
         if "pose" in simulated:
             simulate_poses(
                 writer,
@@ -300,8 +360,17 @@ def _check_bounces(config: Config) -> None:
         )
 
 
-def _subdivided(geometry: Geometry) -> Geometry:
-    finer = tessellate(geometry)
+def _moving(config: Config, scene: Scene) -> Moving:
+    """What may be moved. Raises InputError where receivers or settings do not go with it."""
+    config.fields.check()
+    if config.receivers != "vertices":
+        raise InputError("--receivers: objects that move carry their light at vertices; expected vertices")
+    return find_movers(scene, config.fields, config.subdivide, config.seed)
+
+
+def _subdivided(geometry: Geometry, moving: Moving | None) -> Geometry:
+    movers = () if moving is None else tuple(geometry.object_names.index(m.mesh.name) for m in moving.movers)
+    finer = tessellate(geometry, movers)
     more = len(finer.positions) - len(geometry.positions)
     if more == 0:
         return geometry
@@ -317,23 +386,33 @@ def _receivers(
     both: NDArray[np.bool_],
     plan: list[effects.Decision],
     bounces: bool,
-) -> tuple[Receivers | PixelReceivers, NDArray[np.bool_] | None]:
-    """The receivers, and which of them are buried, (N,), where there are any on vertices.
+    moving: Moving | None,
+    uncut: Geometry,
+) -> tuple[Receivers | PixelReceivers, NDArray[np.bool_] | None, tuple[int, ...]]:
+    """The receivers; which of them are buried, (N,), where there are any on vertices; and the first receiver of what
+    stays, then of everything that moves. uncut: the geometry before the latter's meshes were put in.
 
     Pixels look at the uncut `source`: they are the same, and lit the same, with and without interreflections.
     """
+    shadows = any(d.effect == "shadows" and d.simulate for d in plan)
+    if moving is not None:
+        still = without(moving, geometry)
+        vertices, buried = on_vertices(still, both), np.zeros(0, bool)
+        if shadows and not config.dry_run and len(vertices):
+            vertices, buried = unburied(still, vertices, _posed(geometry, plan))
+        vertices, starts = add_points(moving, uncut, geometry, vertices)
+        return vertices, np.concatenate([buried, np.zeros(len(vertices) - len(buried), bool)]), starts
     seen = geometry if config.receivers == "vertices" else source
     asked = make_receivers(config.receivers, scene, seen, both, config.pixel_grid, fine=bounces)
     if isinstance(asked, PixelReceivers) and not bounces:
-        return asked, None
+        return asked, None, (0,)
     vertices = on_vertices(geometry, both) if isinstance(asked, PixelReceivers) else asked
     buried = np.zeros(len(vertices), bool)
-    shadows = any(d.effect == "shadows" and d.simulate for d in plan)
     if shadows and not config.dry_run:
         vertices, buried = unburied(geometry, vertices, _posed(geometry, plan))
     if isinstance(asked, PixelReceivers):
-        return with_vertices(asked, vertices), np.concatenate([np.zeros(len(asked), bool), buried])
-    return vertices, buried
+        return with_vertices(asked, vertices), np.concatenate([np.zeros(len(asked), bool), buried]), (0,)
+    return vertices, buried, (0,)
 
 
 def _posed(geometry: Geometry, plan: list[effects.Decision]) -> tuple[int, ...]:
@@ -413,12 +492,14 @@ def _dry_run(
     planning: float,
     shadows: bool,
     bounce_cells: int,
+    moving: Moving | None,
+    uncut: Geometry,
 ) -> dict[str, Any]:
-    """The plan with its cost, predicted from a pilot of a few hundred receivers.
+    """The plan with its cost, predicted from a pilot of a few hundred receivers, and of samples of fields.
 
     The bytes are an upper bound: the mesh counts uncompressed, and the pilot's bits compress worse in small groups.
     """
-    receivers, _ = _receivers(config, scene, source, geometry, both, plan, bool(bounce_cells))
+    receivers, _, _ = _receivers(config, scene, source, geometry, both, plan, bool(bounce_cells), moving, uncut)
     points = receivers.points if isinstance(receivers, PixelReceivers) else receivers
     spent = {"shadows": np.zeros(3), "one-bounce": np.zeros(3)}  # rays, seconds, bytes
     if shadows and len(points):
@@ -449,6 +530,9 @@ def _dry_run(
             cost[1] /= max(1, config.workers)
     if any(d.effect == "pose" and d.simulate for d in plan):
         spent["pose"] = _pose_cost(config, geometry, spent["shadows"])
+    if moving is not None:
+        spent["fields"] = np.array(predict(moving))
+        spent["fields"][1] /= max(1, config.workers)
     rays, seconds, packed = np.sum(list(spent.values()), axis=0)
     rows_of_plan = [_row(d) for d in plan]
     for row in rows_of_plan:

@@ -20,6 +20,7 @@ from relightcli.core.transport.shading import shading_scene
 from relightcli.run import blocks as run
 from relightcli.scene.build import build_geometry
 from relightcli.scene.model import Geometry, Scene
+from relightcli.scene.moving import apply_moves, move_geometry
 from relightcli.scene.parse import load_scene
 from relightcli.scene.posing import apply_poses
 from relightcli.scene.settings import apply_settings
@@ -50,6 +51,7 @@ class ReferenceJob:
     rotate: float
     camera: str
     settings: tuple[str, ...]
+    moves: tuple[str, ...]
     spp: int
     bounces: int
     background: bool
@@ -65,6 +67,8 @@ class ReferenceWorker:
     def __init__(self, job: ReferenceJob) -> None:
         self.job = job
         scene, geometry, _, _ = open_source(Path(job.source), job.allow_outside)
+        moved = apply_moves(scene, job.moves)
+        scene, geometry = moved, move_geometry(geometry, scene, moved)
         geometry, _ = apply_poses(scene, geometry, job.poses)
         materials = apply_settings(scene.materials, job.settings)
         self.camera = scene.cameras[job.camera]
@@ -108,6 +112,8 @@ def render_reference(config: Config, shots: list[Shot], suffix: str, started: fl
     """Path-traces every shot. Samples accumulate in `OUTPUT.samples.partial` until the picture is written."""
     scene, geometry, fingerprint, own_bounces = open_source(config.store, config.allow_outside)
     check_shots(config, shots, scene)
+    for shot in shots:
+        move_geometry(geometry, scene, apply_moves(scene, shot.moves))
     notes = check_poses(config, shots, scene, geometry)
     bounces = own_bounces if config.bounces is None else config.bounces
     written, rays = [], 0
@@ -129,6 +135,7 @@ def render_reference(config: Config, shots: list[Shot], suffix: str, started: fl
             "bounces": bounces,
             "background": config.background,
             "seed": config.seed,
+            **({"move": list(shot.moves)} if shot.moves else {}),
         }
         if shot.poses:
             settings["pose"] = list(shot.poses)
@@ -153,6 +160,7 @@ def render_reference(config: Config, shots: list[Shot], suffix: str, started: fl
                     shot.env_rotate,
                     camera.name,
                     shot.settings,
+                    shot.moves,
                     config.spp,
                     bounces,
                     config.background,
@@ -190,6 +198,7 @@ def render_reference(config: Config, shots: list[Shot], suffix: str, started: fl
             "relight:env_rotate": float(shot.env_rotate),
             "relight:camera": camera.name,
             "relight:set": " ".join(shot.settings),
+            "relight:move": " ".join(shot.moves),
             "relight:reference_spp": passes * per_pass,
             "relight:bounces": bounces,
         }

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import relight_formats as formats
+from relightcli.errors import InputError
 from relightcli.stages.lighting import LightingStore
 from relightcli.stages.outputs import (
     Config,
@@ -28,12 +29,23 @@ def relight(config: Config) -> dict[str, Any]:
     started = time.perf_counter()
     suffix = output_suffix(config.output)
     check(config, suffix)
-    default = Shot(1, config.env, config.env_rotate, config.camera, config.exposure, config.settings, config.poses)
+    default = Shot(
+        1,
+        config.env,
+        config.env_rotate,
+        config.camera,
+        config.exposure,
+        config.settings,
+        config.poses,
+        config.moves,
+    )
     shots = [default] if config.frames is None else read_shots(config.frames, default)
     if config.reference:
         from relightcli.stages.reference import render_reference
 
         return render_reference(config, shots, suffix, started)
+    if any(shot.moves for shot in shots):
+        raise InputError("--move: expected --reference beside it; this version lights moved objects by path tracing")
     lighting = open_lighting(config.store, config.workers)
     check_shots(config, shots, lighting.scene)
     for shot in shots:
@@ -71,6 +83,8 @@ def relight(config: Config) -> dict[str, Any]:
 def open_lighting(path: Path, threads: int) -> LightingStore:
     """The store of any stage that pictures are made from."""
     store = formats.open_store(path)
+    if "fields" in store.attrs:
+        raise InputError(f"{path}: holds fields of what moves; this version makes pictures of it with --reference only")
     if store.kind == "asset":
         from relightcli.stages.asset import AssetStore
 

@@ -11,6 +11,7 @@
     exposure = 0
     set = { "gold.roughness" = 0.2, "red.diffuse" = [0.6, 0.1, 0.1], "floor" = "blue-acrylic" }
     pose = { man = "walk@0" }       # the clip holds until the next; seconds are interpolated between keys of one clip
+    move = { ball = [0, 1, 2] }     # three, six or sixteen numbers as `--move` takes them, the same number in every key
 
     [[key]]
     frame = 25                      # keys may lie beyond the last frame: a full turn in 24 frames without a double
@@ -18,19 +19,22 @@
 
 Before a value's first key it has that key's value, after its last key that one's. A measured material (a text in `set`)
 holds until the next one of the same material; numbers change it further, whichever stands first. Between keys of
-different clips an object stands still in the pose of the former.
+different clips an object stands still in the pose of the former. Of a move, translation and scale are interpolated
+linearly and the rotation takes the shorter way at an even pace.
 """
 
 from __future__ import annotations
 
 import itertools
 import tomllib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from relightcli.errors import InputError
 from relightcli.scene.fields import describe, is_number
+from relightcli.scene.moving import COUNTS, between
 from relightcli.scene.posing import parse_pose
 from relightcli.scene.settings import measured_fit
 
@@ -41,7 +45,8 @@ NUMBERS = ("env_rotate", "exposure")
 
 @dataclass(frozen=True)
 class Shot:
-    """One frame. `env` is a path or a name, None for the default; `settings` are texts as `--set` takes them."""
+    """One frame. `env` is a path or a name, None for the default; `settings` and `moves` are
+    texts as `--set` and `--move` take them."""
 
     number: int
     env: str | None
@@ -50,6 +55,7 @@ class Shot:
     exposure: float
     settings: tuple[str, ...]
     poses: tuple[str, ...] = ()  # as `--pose` takes them; of several for one object the last holds
+    moves: tuple[str, ...] = ()
 
 
 def read_shots(path: Path, default: Shot) -> list[Shot]:
@@ -67,7 +73,7 @@ def read_shots(path: Path, default: Shot) -> list[Shot]:
     previous = None
     for i, key in enumerate(keys):
         where = f"key[{i}]"
-        _known(path, where, key, {"frame", "set", "pose", *STEPPED, *NUMBERS})
+        _known(path, where, key, {"frame", "set", "pose", "move", *STEPPED, *NUMBERS})
         frame = _number(path, f"{where}.frame", key.get("frame"))
         if previous is not None and frame <= previous:
             raise InputError(f"{path}: {where}.frame: expected more than {previous:g}, the key before; found {frame:g}")
@@ -96,6 +102,11 @@ def read_shots(path: Path, default: Shot) -> list[Shot]:
             except InputError as error:
                 raise InputError(f"{path}: {where}.pose.{name}: {error}") from None
             tracks.setdefault(f"pose.{name}", []).append((frame, (pose.clip, pose.seconds)))
+        moves = key.get("move", {})
+        if not isinstance(moves, dict):
+            raise InputError(f"{path}: {where}.move: expected a table; found {moves!r}")
+        for name, value in moves.items():
+            _add_move(path, f"{where}.move.{name}", tracks.setdefault(f"move.{name}", []), frame, value)
     return [_shot(path, first + i, tracks, default) for i in range(count)]
 
 
@@ -117,6 +128,15 @@ def _add_setting(path: Path, where: str, track: list[tuple[float, Any]], frame: 
     track.append((frame, numbers))
 
 
+def _add_move(path: Path, where: str, track: list[tuple[float, Any]], frame: float, value: Any) -> None:
+    numbers = tuple(_number(path, where, v) for v in value) if isinstance(value, list) else ()
+    counts = (len(track[0][1]),) if track else COUNTS
+    if len(numbers) not in counts:
+        before = ", as in the key before" if track else ""
+        raise InputError(f"{path}: {where}: expected {' or '.join(map(str, counts))} numbers{before}; found {value!r}")
+    track.append((frame, numbers))
+
+
 def _shot(path: Path, number: int, tracks: dict[str, list[tuple[float, Any]]], default: Shot) -> Shot:
     env = _held(tracks.get("env"), number)
     if env is not None and (path.parent / env).is_file():
@@ -131,6 +151,11 @@ def _shot(path: Path, number: int, tracks: dict[str, list[tuple[float, Any]]], d
         for name, track in changes.items()
         if not _is_text(track)
     ]
+    moves = [
+        f"{name.removeprefix('move.')}={','.join(repr(v) for v in _between(track, number, between) or ())}"
+        for name, track in tracks.items()
+        if name.startswith("move.")
+    ]
     return Shot(
         number,
         env if env is not None else default.env,
@@ -139,6 +164,7 @@ def _shot(path: Path, number: int, tracks: dict[str, list[tuple[float, Any]]], d
         exposure[0] if exposure else default.exposure,
         (*default.settings, *names, *numbers),
         (*default.poses, *(_pose(n.removeprefix("pose."), t, number) for n, t in tracks.items() if n[:5] == "pose.")),
+        (*default.moves, *moves),
     )
 
 
@@ -166,15 +192,22 @@ def _held(track: list[tuple[float, Any]] | None, number: int) -> str | None:
     return str(past[-1] if past else track[0][1])
 
 
-def _between(track: list[tuple[float, Any]] | None, number: int) -> tuple[float, ...] | None:
+def _linear(low: tuple[float, ...], high: tuple[float, ...], t: float) -> tuple[float, ...]:
+    return tuple((1.0 - t) * x + t * y for x, y in zip(low, high, strict=True))
+
+
+def _between(
+    track: list[tuple[float, Any]] | None,
+    number: int,
+    mix: Callable[[tuple[float, ...], tuple[float, ...], float], tuple[float, ...]] = _linear,
+) -> tuple[float, ...] | None:
     if not track:
         return None
     if number <= track[0][0]:
         return tuple(track[0][1])
     for (a, low), (b, high) in itertools.pairwise(track):
         if a <= number <= b:
-            t = (number - a) / (b - a)
-            return tuple((1.0 - t) * x + t * y for x, y in zip(low, high, strict=True))
+            return mix(low, high, (number - a) / (b - a))
     return tuple(track[-1][1])
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from bisect import bisect_right
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -40,6 +42,8 @@ class VisibilityJob:
     lights: tuple[SphereLight | RectangleLight, ...]
     bounce_cells: int  # cells along a side of the cube of what is seen; 0: no interreflections
     pixels: int = 0  # receivers before the first that is on a vertex
+    movers: tuple[int, ...] = ()  # objects that move: each is alone, and the others are together
+    entities: tuple[int, ...] = (0,)  # the first receiver of the others, then of every mover
     posed: tuple[int, ...] = ()  # objects that only their own receivers see, in the pose in which they stand
 
     def open(self) -> VisibilityWorker:
@@ -53,32 +57,40 @@ class VisibilityWorker:
         def array(name: str) -> Any:
             return formats.worker_array(job.partial, name)
 
+        self.array = array
         self.position, self.normal = array("receivers/position"), array("receivers/normal")
         self.object = array("receivers/object") if job.posed else None
-        self.tracer = self.still = None
-        if job.shadows:
-            mesh, faces = array("mesh/position")[:], array("mesh/face")[:]
-            self.tracer = self.still = Tracer(mesh, faces)
-            if job.posed:
-                self.still = Tracer(mesh, hidden(faces, array("mesh/face_object")[:], job.posed))
+        self.opened: _Open | None = None
         self.out = {name: array(name) for name in _outputs(job)}
         self.lights = pack_lights(job.lights)
-        self.surfaces = _surfaces(array) if job.bounce_cells else None
         self.directions = cube.texel_directions(job.resolution).reshape(-1, 3).astype(np.float32)
         self.solid_angle = cube.solid_angles(job.resolution).reshape(-1).astype(np.float32)
 
     def run(self, block: run.Block) -> run.Info:
         job, rows = self.job, slice(block.start, block.stop)
         position, normal = self.position[rows], self.normal[rows]
-        info: run.Info = {"rays": 0.0, "checked": 0.0, "wrong": 0.0, "inferred": 0.0, "bits": 0.0}
-        parts = []
-        for tracer, some in self._parts(rows):
-            found = self._seen(tracer, block.start, np.arange(len(position))[some], position[some], normal[some], info)
-            parts.append((some, found))
-        seen = parts[0][1] if len(parts) == 1 else _joined(parts)
-        bits = seen["visibility/bits"]
-        for name, values in seen.items():
-            self.out[name][rows] = values
+        info: run.Info = {"rays": 0.0, "checked": 0.0, "wrong": 0.0, "inferred": 0.0, "bits": 0.0, "trace_seconds": 0.0}
+        if job.bounce_cells:
+            info |= {"bounce_rays": 0.0, "bounce_seconds": 0.0}
+        pieces = []
+        for entity, first, end in self._parts(block.start, block.stop):
+            part = slice(first - block.start, end - block.start)
+            seen = self._open(entity)
+            own = np.zeros(0, bool)
+            if self.object is not None:
+                own = np.isin(self.object[first:end], job.posed)
+            if not own.any():
+                pieces.append(self._see(seen.still, seen.surfaces, first, position[part], normal[part], info))
+                continue
+            found = [
+                (some, self._see(tracer, seen.surfaces, first, position[part][some], normal[part][some], info))
+                for tracer, some in ((seen.still, ~own), (seen.tracer, own))
+                if some.any()
+            ]
+            pieces.append(_joined(found))
+        for name in pieces[0]:
+            self.out[name][rows] = np.concatenate([piece[name] for piece in pieces])
+        bits = np.concatenate([piece["visibility/bits"] for piece in pieces])
         if job.basis == "sh":
             self.out["direct/sh"][rows] = sh.cosine_transfer(bits, normal, job.sh_order)
         elif job.basis == "haar":
@@ -92,72 +104,76 @@ class VisibilityWorker:
             self.out["direct/dense"][rows] = _dense(bits, normal, self.directions, self.solid_angle)
         return info
 
-    def _parts(self, rows: slice) -> list[tuple[Tracer | None, slice | NDArray[np.bool_]]]:
-        """Ray tracers, and which of these receivers see what is in them."""
-        if self.object is None:
-            return [(self.tracer, slice(None))]
-        own = np.isin(self.object[rows], self.job.posed)
-        return [(t, some) for t, some in ((self.still, ~own), (self.tracer, own)) if some.any()]
+    def _parts(self, start: int, stop: int) -> list[tuple[int, int, int]]:
+        """(entity, first, past the last receiver) of a block's parts; pixels and vertices apart, as if alone."""
+        cuts = sorted({*self.job.entities, self.job.pixels})
+        ends = [start, *(c for c in cuts if start < c < stop), stop]
+        return [(bisect_right(self.job.entities, a) - 1, a, b) for a, b in pairwise(ends)]
 
-    def _seen(
+    def _open(self, entity: int) -> _Open:
+        """Rays over what an entity's receivers can see, and who receives there."""
+        if self.opened is None or self.opened.entity != entity:
+            self.opened = None
+            array, job = self.array, self.job
+            owner = array("mesh/face_object")[:]
+            own = owner == job.movers[entity - 1] if entity else ~np.isin(owner, job.movers)
+            tracer = still = None
+            if job.shadows:
+                mesh, faces = array("mesh/position")[:], array("mesh/face")[:][own]
+                tracer = still = Tracer(mesh, faces)
+                if job.posed:
+                    still = Tracer(mesh, hidden(faces, owner[own], job.posed))
+            self.opened = _Open(entity, tracer, still, _surfaces(array, own) if job.bounce_cells else None)
+        return self.opened
+
+    def _see(
         self,
         tracer: Tracer | None,
+        surfaces: Surfaces | None,
         first: int,
-        place: NDArray[np.intp],
         position: NDArray[np.float64],
         normal: NDArray[np.float32],
         info: dict[str, float],
     ) -> dict[str, NDArray[Any]]:
-        """What the receivers at `place` of the block from `first` on see of sky, lights and surfaces, by array."""
+        """What receivers of the part from `first` on see of sky, lights and surfaces, by array."""
         job = self.job
         start = time.perf_counter()
         if tracer is None:
             bits = visibility.horizon_bits(normal, job.resolution)
         else:
-            bits = self._trace(tracer, first, place, position, normal, info)
-        out: dict[str, NDArray[Any]] = {"visibility/bits": bits}
-        if self.lights.number:
-            out["lights/bits"], rays = light_bits(tracer, self.lights, position, normal)
-            info["rays"] += float(rays)
-        info["trace_seconds"] = info.get("trace_seconds", 0.0) + time.perf_counter() - start
-        if self.surfaces is not None and tracer is not None:
-            start = time.perf_counter()
-            out["bounce/hit"], rays = trace_hits(
-                tracer, self.surfaces, position, normal, bits, job.bounce_cells, first, job.seed
-            )
-            info["bounce_rays"] = info.get("bounce_rays", 0.0) + float(rays)
-            info["bounce_seconds"] = info.get("bounce_seconds", 0.0) + time.perf_counter() - start
-            info["rays"] += float(rays)
-        return out
-
-    def _trace(
-        self,
-        tracer: Tracer,
-        first: int,
-        place: NDArray[np.intp],
-        position: NDArray[np.float64],
-        normal: NDArray[np.float32],
-        info: dict[str, float],
-    ) -> NDArray[np.uint8]:
-        """Visibility bits of receivers of the block from `first` on; pixels and vertices apart, as if alone."""
-        job = self.job
-        cut = int(np.searchsorted(place, job.pixels - first))
-        bits = []
-        for rows in (slice(0, cut), slice(cut, len(position))):
-            if rows.start == rows.stop:
-                continue
-            seed = job.seed + first + rows.start
-            traced = visibility.trace_visibility(tracer, position[rows], normal[rows], job.resolution, job.refine, seed)
-            bits.append(traced.bits)
+            traced = visibility.trace_visibility(tracer, position, normal, job.resolution, job.refine, job.seed + first)
+            bits = traced.bits
             info["rays"] += float(traced.rays)
             info["checked"] += float(traced.checked)
             info["wrong"] += float(traced.wrong)
             info["inferred"] += float(traced.inferred)
-            info["bits"] += float(3 * job.resolution**2 * len(traced.bits))
-        return bits[0] if len(bits) == 1 else np.concatenate(bits)
+            info["bits"] += float(3 * job.resolution**2 * len(bits))
+        out: dict[str, NDArray[Any]] = {"visibility/bits": bits}
+        if self.lights.number:
+            out["lights/bits"], rays = light_bits(tracer, self.lights, position, normal)
+            info["rays"] += float(rays)
+        info["trace_seconds"] += time.perf_counter() - start
+        if surfaces is not None and tracer is not None:
+            start = time.perf_counter()
+            hits = trace_hits(tracer, surfaces, position, normal, bits, job.bounce_cells, first, job.seed)
+            out["bounce/hit"], rays = hits
+            info["bounce_rays"] += float(rays)
+            info["bounce_seconds"] += time.perf_counter() - start
+            info["rays"] += float(rays)
+        return out
 
 
-def _joined(parts: list[tuple[Any, dict[str, NDArray[Any]]]]) -> dict[str, NDArray[Any]]:
+@dataclass(frozen=True)
+class _Open:
+    """Rays over an entity; `still` over it without what is posed, for the receivers of other objects."""
+
+    entity: int
+    tracer: Tracer | None
+    still: Tracer | None
+    surfaces: Surfaces | None
+
+
+def _joined(parts: list[tuple[NDArray[np.bool_], dict[str, NDArray[Any]]]]) -> dict[str, NDArray[Any]]:
     """One array of each name, its rows put together from parts."""
     out = {}
     for name, values in parts[0][1].items():
@@ -167,13 +183,14 @@ def _joined(parts: list[tuple[Any, dict[str, NDArray[Any]]]]) -> dict[str, NDArr
     return out
 
 
-def _surfaces(array: Any) -> Surfaces:
-    """Mesh and receivers of the unfinished store, as `trace_hits` wants them; `array` opens one by name."""
+def _surfaces(array: Any, own: NDArray[np.bool_]) -> Surfaces:
+    """Mesh and receivers of the unfinished store, as `trace_hits` wants them; `array` opens one by name. own (F,): the
+    faces that are traced."""
     position = array("mesh/position")[:]
     front, back = receivers_of_vertices(array("receivers/vertex")[:], array("receivers/side")[:], len(position))
-    two_sided = array("objects/two_sided")[:][array("mesh/face_object")[:]]
+    two_sided = array("objects/two_sided")[:][array("mesh/face_object")[:][own]]
     buried = array("receivers/buried")[:]
-    return Surfaces(position, array("mesh/normal")[:], array("mesh/face")[:], two_sided, front, back, buried)
+    return Surfaces(position, array("mesh/normal")[:], array("mesh/face")[:][own], two_sided, front, back, buried)
 
 
 def _dense(

@@ -12,8 +12,8 @@ from relightcli.plan.effects import (
     bounces_asked,
     bounces_needed,
     decide,
+    decide_fields,
     decide_pose,
-    need_static,
     parse_effects,
 )
 from relightcli.plan.pilot import Share
@@ -36,7 +36,7 @@ def test_names():
     [
         ("caustics", "expected auto, all or names out of direct, .*; found 'caustics'"),
         ("", "found ''"),
-        ("direct,fields", "'fields' is not simulated by this version"),
+        ("direct,pose", "'pose' is not simulated by this version"),
         ("direct,one-bounce", "'one-bounce' needs 'shadows'"),
         ("direct,shadows,two-bounce", "'two-bounce' needs 'one-bounce'"),
         ("shadows", "'direct' must be among them"),
@@ -45,14 +45,6 @@ def test_names():
 def test_names_that_are_refused(text, message):
     with pytest.raises(InputError, match=message):
         parse_effects(text)
-
-
-def test_moving_objects_need_an_effect_that_is_not_there():
-    need_static({"a": "static"}, None)
-    need_static({"a": "rigid"}, ("direct", "shadows"))
-    need_static({"a": "skinned"}, None)
-    with pytest.raises(InputError, match=r"objects\.b\.motion is 'rigid'.*'fields'"):
-        need_static({"a": "static", "b": "rigid"}, None)
 
 
 @pytest.mark.parametrize(
@@ -70,6 +62,25 @@ def test_poses_of_what_has_clips(asked, clips, simulate, evidence):
     decision = decide_pose(asked, clips)
     assert decision.simulate == simulate
     assert decision.evidence.startswith(evidence)
+
+
+@pytest.mark.parametrize(
+    ("effects", "motion", "lights", "simulate", "evidence"),
+    [
+        ("auto", "rigid", 0, True, "b may be moved"),
+        ("auto", "rigid", 2, True, "b may be moved, and 2 local lights"),
+        ("auto", "static", 2, False, "nothing moves"),
+        ("all", "static", 2, False, "nothing moves"),
+        ("all", "rigid", 0, True, "b may be moved"),
+        ("direct,fields", "static", 2, True, "no object may be moved, and 2 local lights"),
+        ("direct,fields", "static", 0, False, "nothing moves"),
+        ("direct,shadows", "rigid", 0, False, "not asked for"),
+    ],
+)
+def test_fields_are_for_what_moves(effects, motion, lights, simulate, evidence):
+    decision = decide_fields(parse_effects(effects), {"a": "static", "b": motion}, lights)
+    assert (decision.simulate, decision.effect) == (simulate, "fields")
+    assert evidence in decision.evidence
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e6])
@@ -194,6 +205,8 @@ def test_decisions_come_with_their_evidence():
     assert shadows(None, both=True).simulate
     assert "both sides" in shadows(None, both=True).evidence
     assert shadows(("direct", "shadows")).simulate
+    moving = {d.effect: d for d in decide(None, BALL, BALL_FACES, False, False, 0, moving=True)}
+    assert moving["shadows"].simulate
     assert not shadows(("direct",), faces=BALL_FACES[:, ::-1]).simulate
 
 

@@ -111,3 +111,29 @@ def test_outside_files_need_permission(scene, tmp_path):
         render(folder / "scene.toml", tmp_path / "a.exr")
     render(folder / "scene.toml", tmp_path / "a.exr", allow_outside=True, spp=1)
     assert (tmp_path / "a.exr").exists()
+
+
+def test_moved_objects_are_where_another_scene_file_has_them(tmp_path):
+    ball = sphere(0.5, rings=8, material=lambert(0.7))
+    parts = {"ground": square(4, material=lambert(0.5)), "ball": ball}
+    maps = {"patchy": np.random.default_rng(0).random((4, 8, 3))}
+    pictures = []
+    for name, place, move in (("here", (0, 0.5, 0), ()), ("there", (1, 0.7, 0), ("ball=0,0.5,0", "lamp=0,2,0"))):
+        height = 2 if name == "here" else 3
+        path = write_scene(tmp_path / name, parts, [CAMERA], maps)
+        text = path.read_text().replace(
+            "mesh = 'ball.obj'", f"mesh = 'ball.obj'\nmotion = 'rigid'\ntranslate = {list(place)}"
+        )
+        lamp = f"[lights.lamp]\nshape = 'sphere'\ncenter = [0, {height}, 0]\nradius = 0.2\nradiance = [5, 5, 5]\n"
+        path.write_text(text + lamp)
+        render(path, tmp_path / f"{name}.exr", moves=move, bounces=1)
+        pictures.append(read_layers(tmp_path / f"{name}.exr")[""])
+    assert pictures[0].max() > 0.0
+    np.testing.assert_array_equal(*pictures)
+
+
+def test_only_what_is_there_can_be_moved(scene, tmp_path):
+    with pytest.raises(InputError, match=r"objects.ball.motion is 'static'"):
+        render(scene, tmp_path / "a.exr", moves=("ball=0,1,0",))
+    with pytest.raises(InputError, match="--reference"):
+        render(scene, tmp_path / "a.exr", moves=("ball=0,1,0",), reference=False)

@@ -1,8 +1,12 @@
 """Keyframe files: interpolation, what holds, and what is refused."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
 from relightcli.errors import InputError
+from relightcli.scene.moving import parse_move
 from relightcli.stages.shots import Shot, read_shots
 
 DEFAULT = Shot(1, "sky", 5.0, "main", -1.0, ("gold.f0=0.5",), ("man=none@0",))
@@ -74,6 +78,19 @@ def test_poses_go_on_within_a_clip_and_stand_still_between_two(tmp_path):
     assert poses == [("man=none@0", f"man={pose}") for pose in seconds]
 
 
+def test_moves_are_interpolated_and_follow_those_of_the_command_line(tmp_path):
+    path = tmp_path / "shots.toml"
+    path.write_text(
+        "format = 1\nframes = 3\n"
+        "[[key]]\nframe = 1\nmove = { ball = [0, 0, 0], block = [0, 0, 0, 0, 90, 0] }\n"
+        "[[key]]\nframe = 3\nmove = { ball = [2, 4, 0], block = [0, 0, 1, 0, 0, 0] }\n"
+    )
+    found = read_shots(path, replace(DEFAULT, moves=("lamp=1,1,1",)))
+    assert [s.moves[:2] for s in found] == [("lamp=1,1,1", f"ball={x}.0,{2 * x}.0,0.0") for x in (0, 1, 2)]
+    turned = [parse_move(s.moves[2])[1] for s in found]
+    np.testing.assert_allclose(turned, [(0, 0, 0, 0, 90, 0), (0, 0, 0.5, 0, 45, 0), (0, 0, 1, 0, 0, 0)], atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -111,6 +128,14 @@ def test_poses_go_on_within_a_clip_and_stand_still_between_two(tmp_path):
         ("frames = 2\n[[key]]\nframe = 1\npose = 'x@1'", r"key\[0\].pose: expected a table"),
         ("frames = 2\n[[key]]\nframe = 1\npose = { a = 1 }", r"key\[0\].pose.a: expected a text CLIP@SECONDS"),
         ("frames = 2\n[[key]]\nframe = 1\npose = { a = 'x' }", r"key\[0\].pose.a: --pose a=x: expected OBJECT="),
+        ("frames = 2\n[[key]]\nframe = 1\nmove = 3", r"key\[0\].move: expected a table"),
+        ("frames = 2\n[[key]]\nframe = 1\nmove = { a = [1, 2] }", r"key\[0\].move.a: expected 3 or 6 or 16 numbers"),
+        ("frames = 2\n[[key]]\nframe = 1\nmove = { a = [1, 2, inf] }", r"key\[0\].move.a: expected a finite number"),
+        (
+            "frames = 2\n[[key]]\nframe = 1\nmove = { a = [1, 2, 3] }\n"
+            "[[key]]\nframe = 2\nmove = { a = [1, 2, 3, 0, 0, 0] }",
+            r"key\[1\].move.a: expected 3 numbers, as in the key before",
+        ),
         ("frames = ", "not a TOML file"),
     ],
 )

@@ -12,6 +12,7 @@ neighbouring faces stay joined, because they share the cut edges. Skinned object
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 from typing import Any
 
@@ -27,16 +28,17 @@ MOST_NEW_VERTICES = 40_000
 MOST_ROUNDS = 40
 
 
-def tessellate(geometry: Geometry) -> Geometry:
+def tessellate(geometry: Geometry, whole: Collection[int] = ()) -> Geometry:
     """The same scene with no edge longer than h; new vertices come after the old ones. The same object if none is.
 
+    Objects of the indices `whole` are not cut, but others are near them.
     Where that would take more than MOST_NEW_VERTICES, h is widened until it does not.
     """
     diagonals = _diagonals(geometry)
-    first = _refine(geometry, _Limit(geometry, diagonals, near=False))
+    first = _refine(geometry, _Limit(geometry, diagonals, near=False, whole=whole))
     if len(geometry.object_names) < 2:
         return first
-    return _refine(first, _Limit(first, diagonals, near=True))
+    return _refine(first, _Limit(first, diagonals, near=True, whole=whole))
 
 
 def _diagonals(geometry: Geometry) -> NDArray[np.float64]:
@@ -51,10 +53,12 @@ def _diagonals(geometry: Geometry) -> NDArray[np.float64]:
 class _Limit:
     """h, without or with the part that looks at other objects' vertices. `floor` (O,): the least it can be."""
 
-    def __init__(self, geometry: Geometry, diagonals: NDArray[np.float64], near: bool) -> None:
-        self.widest = diagonals / OBJECT_PARTS
-        self.kept = np.array([name in geometry.rigs for name in geometry.object_names], bool)
-        self.widest[self.kept] = np.inf
+    def __init__(
+        self, geometry: Geometry, diagonals: NDArray[np.float64], near: bool, whole: Collection[int] = ()
+    ) -> None:
+        self.whole = np.isin(np.arange(len(diagonals)), list(whole))
+        self.whole |= np.array([name in geometry.rigs for name in geometry.object_names], bool)
+        self.widest = np.where(self.whole, np.inf, diagonals / OBJECT_PARTS)
         self.nearest = diagonals / NEAR_PARTS
         self.floor = self.widest.copy()
         self.trees: list[Any] = []
@@ -67,7 +71,7 @@ class _Limit:
             self.trees.append(cKDTree(geometry.positions[used]))
             others = np.arange(len(diagonals)) != k
             self.floor[others] = np.minimum(self.floor[others], self.nearest[k])
-        self.floor[self.kept] = np.inf
+        self.floor[self.whole] = np.inf
 
     def exceeded(
         self, middle: NDArray[np.float64], length: NDArray[np.float64], owner: NDArray[np.int32]
@@ -78,10 +82,9 @@ class _Limit:
             # The box around an object is nearer than the object: most edges need no search.
             outside = np.maximum(np.maximum(tree.mins - middle, middle - tree.maxes), 0.0)
             least = np.maximum(self.nearest[k], SLOPE * np.linalg.norm(outside, axis=1))
-            ask = np.flatnonzero(~out & (owner != k) & (length > least))
+            ask = np.flatnonzero(~out & (owner != k) & ~self.whole[owner] & (length > least))
             if len(ask):
                 out[ask] = length[ask] > np.maximum(self.nearest[k], SLOPE * tree.query(middle[ask])[0])
-        out &= ~self.kept[owner]
         return out
 
 

@@ -1,0 +1,208 @@
+"""Entities of a scene: fields put somewhere, and which of them lies before which as a point sees them. [Pan 2007, 5]
+
+An entity's own frame goes to the world by x -> scale * rotation x + translation. Entities are sorted by the distance to
+the nearest point of their surface, which the paper leaves undefined: by their centres, a small ball behind a large wall
+would come before it. The distance taken is that to the entity's box and to its bounding sphere, whichever is larger:
+both hold the entity, and for boxes, walls and balls one of them is the surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from relightcli.core.fields.field import Field, SourceField
+from relightcli.core.fields.interpolate import CORNERS, Grid, locate_one, make_grid
+from relightcli.core.shade.gather import in_parts
+from relightcli.core.sphere.rotation import rotation_matrices
+
+
+class Transfer(Protocol):
+    """The transfer of an object's samples, in whichever form it is kept."""
+
+    def reflect(self, light: NDArray[np.floating], which: NDArray[np.integer]) -> NDArray[np.float32]:
+        """Radiance (k, 3, N) float32 of the object seen from samples `which` (k,), light (m, 3, N) at its proxies."""
+
+
+@dataclass(frozen=True)
+class PlainTransfer:
+    """Transfer (samples, m, N, N, C) float32 as it was simulated."""
+
+    transfer: NDArray[np.float32]
+
+    def reflect(self, light: NDArray[np.floating], which: NDArray[np.integer]) -> NDArray[np.float32]:
+        _, m, n, _, colours = self.transfer.shape
+        own = self.transfer[which]
+        out = np.empty((len(which), 3, n), np.float32)
+        for c in range(3):
+            matrices = own[..., c % colours].transpose(0, 2, 1, 3).reshape(len(which) * n, m * n)
+            out[:, c] = (matrices @ light[:, c].reshape(-1).astype(np.float32)).reshape(len(which), n)
+        return out
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What an entity does to the light around it, in its own frame, wherever it is put.
+
+    grid about center (3,); box (2, 3), least and greatest corner of the surface; radius of its bounding sphere
+    occlusion (samples, N) float32, None if it blocks nothing; transfer, None if it reflects nothing; radiance
+    (samples, N, 3) float32 that it emits, None if none; proxies (m, 3), none without transfer.
+    """
+
+    grid: Grid
+    center: NDArray[np.float64]
+    box: NDArray[np.float64]
+    radius: float
+    occlusion: NDArray[np.float32] | None = None
+    transfer: Transfer | None = None
+    radiance: NDArray[np.float32] | None = None
+    proxies: NDArray[np.float64] | None = None
+
+
+def of_object(field: Field, box: NDArray[np.float64], transfer: Transfer | None = None) -> Surroundings:
+    """An object; `transfer` takes the place of the field's own."""
+    n = field.occlusion.shape[-1]
+    plain = PlainTransfer(field.transfer.reshape(-1, *field.transfer.shape[2:]))
+    return Surroundings(
+        make_grid(field.radii, field.resolution, field.valid),
+        field.center,
+        np.asarray(box, np.float64),
+        field.radius,
+        field.occlusion.reshape(-1, n),
+        transfer or plain,
+        None,
+        field.proxies,
+    )
+
+
+def of_light(field: SourceField) -> Surroundings:
+    """A local light: it blocks nothing."""
+    grid = make_grid(field.radii, field.resolution)
+    box = np.stack([field.center - field.radius, field.center + field.radius])
+    n = field.radiance.shape[-2]
+    return Surroundings(grid, field.center, box, field.radius, radiance=field.radiance.reshape(-1, n, 3))
+
+
+@dataclass(frozen=True)
+class Entity:
+    """Surroundings somewhere: rotation (3, 3), translation (3,), scale > 0, the same along all axes."""
+
+    own: Surroundings
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+    scale: float = 1.0
+
+    @property
+    def proxies(self) -> NDArray[np.float64]:
+        """Proxies in the world, (m, 3)."""
+        if self.own.proxies is None:
+            return np.zeros((0, 3))
+        found: NDArray[np.float64] = self.scale * (self.own.proxies @ self.rotation.T) + self.translation
+        return found
+
+    def turn(self, order: int) -> NDArray[np.float64]:
+        """(N, N): coefficients in the entity's frame to those in the world's."""
+        return rotation_matrices(self.rotation, order)
+
+
+class Lookup(NamedTuple):
+    """Where points read the entities' fields.
+
+    sample (T,) int64: the samples that are read, in their entity's own list; those of entity e are start[e] to
+    start[e + 1], start (E + 1,)
+    place (n, E, 8) int32 among them, weight (n, E, 8) float32
+    nearest (n, E) int32: entities from near to far, one that is left out -1 at the end
+    """
+
+    sample: NDArray[np.int64]
+    start: NDArray[np.int64]
+    place: NDArray[np.int32]
+    weight: NDArray[np.float32]
+    nearest: NDArray[np.int32]
+
+    def part(self, e: int) -> slice:
+        return slice(int(self.start[e]), int(self.start[e + 1]))
+
+
+def look_up(entities: list[Entity], points: NDArray[np.floating], skip: NDArray[np.int32], threads: int = 1) -> Lookup:
+    """Looks up all entities but number skip (n,) (-1: none) at points (n, 3) of the world."""
+    p = np.ascontiguousarray(points, np.float64)
+    count = len(entities)
+    first = np.concatenate([[0], np.cumsum([len(e.own.grid.stand_in) for e in entities])]).astype(np.int64)
+    place, weight = np.zeros((len(p), count, CORNERS), np.int32), np.zeros((len(p), count, CORNERS), np.float32)
+    distance, nearest = np.empty((len(p), count)), np.empty((len(p), count), np.int32)
+    read = np.zeros(int(first[-1]), np.bool_)
+    skip = np.ascontiguousarray(skip, np.int32)
+
+    def visit(a: int, b: int) -> None:
+        for e, entity in enumerate(entities):
+            own = entity.own
+            frame = entity.rotation, entity.translation, float(entity.scale), own.center, own.box, float(own.radius)
+            _visit(p[a:b], skip[a:b], e, first[e], *frame, *own.grid, place[a:b], weight[a:b], distance[a:b], read)
+        _order(distance[a:b], skip[a:b], nearest[a:b])
+
+    in_parts(visit, len(p), threads)
+    found = np.flatnonzero(read)
+    number = np.zeros(len(read), np.int32)
+    number[found] = np.arange(len(found), dtype=np.int32)
+    in_parts(lambda a, b: _renumber(number, weight[a:b], place[a:b]), len(p), threads)
+    start = np.searchsorted(found, first)
+    return Lookup(found - np.repeat(first[:-1], np.diff(start)), start, place, weight, nearest)
+
+
+@njit(cache=True, nogil=True)
+def _visit(  # type: ignore[no-untyped-def]
+    points, skip, e, start, rotation, translation, scale, center, box, radius, radii, logarithmic, padded, stand_in,
+    index, weight, distance, read,
+):  # fmt: skip
+    q = np.empty(3)
+    for i in range(len(points)):
+        if skip[i] == e:
+            distance[i, e] = np.inf
+            continue
+        for x in range(3):
+            total = 0.0
+            for y in range(3):
+                total += rotation[y, x] * (points[i, y] - translation[y])
+            q[x] = total / scale
+        outside, inside, square = 0.0, -np.inf, 0.0
+        for x in range(3):
+            beyond = max(box[0, x] - q[x], q[x] - box[1, x])
+            inside = max(inside, beyond)
+            outside += max(beyond, 0.0) ** 2
+            q[x] -= center[x]
+            square += q[x] * q[x]
+        to_box = np.sqrt(outside) if outside > 0.0 else inside
+        distance[i, e] = scale * max(to_box, np.sqrt(square) - radius)
+        locate_one(q[0], q[1], q[2], radii, logarithmic, padded, stand_in, index[i, e], weight[i, e])
+        for k in range(index.shape[2]):
+            index[i, e, k] += start
+            if weight[i, e, k] > 0.0:
+                read[index[i, e, k]] = True
+
+
+@njit(cache=True, nogil=True)
+def _order(distance, skip, nearest):  # type: ignore[no-untyped-def]
+    """Insertion sort, stable: of two at the same distance the first in the list comes first."""
+    count = distance.shape[1]
+    for i in range(len(distance)):
+        for e in range(count):
+            k = e
+            while k > 0 and distance[i, nearest[i, k - 1]] > distance[i, e]:
+                nearest[i, k] = nearest[i, k - 1]
+                k -= 1
+            nearest[i, k] = e
+        if skip[i] >= 0:  # at an infinite distance: the last
+            nearest[i, count - 1] = -1
+
+
+@njit(cache=True, nogil=True)
+def _renumber(number, weight, place):  # type: ignore[no-untyped-def]
+    for i in range(place.shape[0]):
+        for e in range(place.shape[1]):
+            for k in range(place.shape[2]):
+                place[i, e, k] = number[place[i, e, k]] if weight[i, e, k] > 0.0 else 0

@@ -1,0 +1,172 @@
+"""Values of a field between its samples: four directions on each of two shells. [Pan 2007, Eq. 10]
+
+Between shells the weight is linear in the logarithm of the distance (shells in equal ratios) or in the distance (equal
+steps). On a shell it is bilinear over the cube map's texels; over the edge of a face the row of the neighbour goes on,
+and at the cube's eight corners the fourth sample is the mean of the three that meet there: the weights are continuous
+everywhere and sum to 1.
+
+Inside the innermost shell its values hold; outside the outermost its difference from empty space falls as the square
+of the distance. Samples inside the object are left out, the others' weights fill up; where all eight are, those further
+out in the same directions stand in.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from relightcli.core.sphere import cube
+
+CORNERS = 8
+_CORNER = -1  # in a padded face: no texel, the mean of the three around it
+_LEAST = 1e-4  # share of the weights below which the samples that are left say nothing
+
+
+class Grid(NamedTuple):
+    """Where samples lie and which are to be used.
+
+    radii (S,) float64, rising; logarithmic: weights between shells; padded (6, n + 2, n + 2) int32, texels of the faces
+    and of the rows around them, -1 in the corners; stand_in (S 6nn,) int32: the sample itself where it is valid, else
+    the next one further out in its direction, or -1.
+    """
+
+    radii: NDArray[np.float64]
+    logarithmic: bool
+    padded: NDArray[np.int32]
+    stand_in: NDArray[np.int32]
+
+
+def make_grid(
+    radii: NDArray[np.float64], resolution: int, valid: NDArray[np.bool_] | None = None, logarithmic: bool | None = None
+) -> Grid:
+    """The grid of a field: radii (S,), n, valid (S, 6nn). `logarithmic` None: as the radii are nearer to equal ratios
+    or to equal steps."""
+    radii = np.asarray(radii, np.float64)
+    if logarithmic is None:
+        ratios, steps = np.diff(np.log(radii)), np.diff(radii)
+        logarithmic = len(radii) < 3 or bool(np.ptp(ratios) * steps.mean() <= np.ptp(steps) * ratios.mean())
+    texels = 6 * resolution * resolution
+    own = np.arange(len(radii) * texels, dtype=np.int32).reshape(len(radii), texels)
+    stand_in = np.where(True if valid is None else valid, own, -1).astype(np.int32)
+    for shell in range(len(radii) - 2, -1, -1):
+        stand_in[shell] = np.where(stand_in[shell] < 0, stand_in[shell + 1], stand_in[shell])
+    return Grid(radii, logarithmic, _padded(resolution), stand_in.reshape(-1))
+
+
+@lru_cache(maxsize=8)
+def _padded(resolution: int) -> NDArray[np.int32]:
+    n = resolution
+    # Just over the edge, so that the place along it stays: the neighbour's texel there has the same one.
+    c = np.concatenate([[-1.0 - 1e-6], cube.texel_centers(n), [1.0 + 1e-6]])
+    out = np.empty((6, n + 2, n + 2), np.int32)
+    for face in range(6):
+        out[face] = cube.texel_index(cube.face_directions(face, c[None, :], c[:, None]), n)
+    out[:, [0, 0, -1, -1], [0, -1, 0, -1]] = _CORNER
+    return out
+
+
+def locate(grid: Grid, points: NDArray[np.floating]) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Samples (n, 8) int32 and weights (n, 8) float32 for points (n, 3) about the field's centre.
+
+    The weights sum to 1, less outside the outermost shell: the rest belongs to empty space (see `blend`). Nothing is
+    refused: at the centre the direction is +X.
+    """
+    p = np.ascontiguousarray(points, np.float64)
+    index, weight = np.empty((len(p), CORNERS), np.int32), np.empty((len(p), CORNERS), np.float32)
+    _locate(p, grid.radii, grid.logarithmic, grid.padded, grid.stand_in, index, weight)
+    return index, weight
+
+
+def blend(
+    index: NDArray[np.int32], weight: NDArray[np.float32], values: NDArray[np.floating], empty: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """Values at points: sum of weight times values (samples, ...), the weights' rest times `empty` (...)."""
+    w = weight.astype(np.float64)
+    rest = 1.0 - w.sum(1)
+    found: NDArray[np.float64] = np.einsum("nk,nk...->n...", w, values[index])
+    return found + np.multiply.outer(rest, empty)
+
+
+@njit(cache=True, nogil=True)
+def locate_one(x, y, z, radii, logarithmic, padded, stand_in, index, weight):  # type: ignore[no-untyped-def]
+    """The samples and weights of one point, into index and weight (8,)."""
+    n = padded.shape[1] - 2
+    distance = math.sqrt(x * x + y * y + z * z)
+    ax, ay, az = abs(x), abs(y), abs(z)
+    # Faces +X -X +Y -Y +Z -Z as in core.sphere.cube.
+    if ax >= ay and ax >= az:
+        face, s, t, major = (0, -z, -y, ax) if x >= 0.0 else (1, z, -y, ax)
+    elif ay >= az:
+        face, s, t, major = (2, x, z, ay) if y >= 0.0 else (3, x, -z, ay)
+    else:
+        face, s, t, major = (4, x, -y, az) if z >= 0.0 else (5, -x, -y, az)
+    if major > 0.0:
+        s, t = s / major, t / major
+    else:
+        s, t = 0.0, 0.0
+    u, v = (s + 1.0) * 0.5 * n + 0.5, (t + 1.0) * 0.5 * n + 0.5  # in padded texels, whose centres are whole numbers
+    j, i = min(max(int(u), 0), n), min(max(int(v), 0), n)
+    u, v = u - j, v - i
+    last = len(radii) - 1
+    low, along, fade = 0, 0.0, 1.0
+    if distance >= radii[last]:
+        low, fade = last, (radii[last] / distance) ** 2
+    elif distance > radii[0]:
+        low = int(np.searchsorted(radii, distance, side="right")) - 1
+        if logarithmic:
+            along = math.log(distance / radii[low]) / math.log(radii[low + 1] / radii[low])
+        else:
+            along = (distance - radii[low]) / (radii[low + 1] - radii[low])
+    high = min(low + 1, last)
+    weight[0], weight[1] = (1.0 - u) * (1.0 - v), u * (1.0 - v)
+    weight[2], weight[3] = (1.0 - u) * v, u * v
+    index[0], index[1] = padded[face, i, j], padded[face, i, j + 1]
+    index[2], index[3] = padded[face, i + 1, j], padded[face, i + 1, j + 1]
+    for k in range(4):
+        if index[k] < 0:
+            third = weight[k] / 3.0
+            weight[k] = 0.0
+            for other in range(4):
+                if other != k:
+                    weight[other] += third
+            index[k] = index[(k + 1) % 4]
+    total = 0.0
+    texels = 6 * n * n
+    for k in range(4):
+        w = weight[k]
+        at = index[k]
+        index[k], weight[k] = low * texels + at, w * (1.0 - along)
+        index[k + 4], weight[k + 4] = high * texels + at, w * along
+    for k in range(8):
+        if stand_in[index[k]] == index[k]:
+            total += weight[k]
+    if total >= 1.0 - 1e-12:
+        scale = fade
+    elif total > _LEAST:
+        for k in range(8):
+            if stand_in[index[k]] != index[k]:
+                weight[k] = 0.0
+        scale = fade / total
+    else:
+        left = 0.0
+        for k in range(8):
+            at = stand_in[index[k]]
+            if at < 0:
+                weight[k] = 0.0
+            else:
+                index[k] = at
+                left += weight[k]
+        scale = fade / left if left > _LEAST else 0.0
+    for k in range(8):
+        weight[k] *= scale
+
+
+@njit(cache=True, nogil=True)
+def _locate(points, radii, logarithmic, padded, stand_in, index, weight):  # type: ignore[no-untyped-def]
+    for i in range(len(points)):
+        locate_one(points[i, 0], points[i, 1], points[i, 2], radii, logarithmic, padded, stand_in, index[i], weight[i])
