@@ -72,10 +72,11 @@ class Ahead:
 
 
 def fit_tracer(traced: Sequence[Traced]) -> Tracer:
-    """From pictures of several sample counts: the mean of error^2 spp, and the slope of seconds from least to most."""
+    """From pictures of several sample counts: error sqrt(spp) of the most, which is least where samples are stratified,
+    in favour of tracing; and the slope of seconds from least to most."""
     ordered = sorted(traced, key=lambda t: t.spp)
-    noise = math.sqrt(sum(t.error**2 * t.spp for t in ordered) / len(ordered))
     low, high = ordered[0], ordered[-1]
+    noise = high.error * math.sqrt(high.spp)
     slope = (high.seconds - low.seconds) / (high.spp - low.spp) if high.spp > low.spp else 0.0
     return Tracer(noise, slope if slope > 0 else high.seconds / high.spp)
 
