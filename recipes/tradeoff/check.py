@@ -10,7 +10,7 @@ result = json.loads(Path(sys.argv[1]).read_text())
 limit = float(sys.argv[2])
 for point in result["points"]:
     print(f"{point['error']:8.2%} {point['seconds']:8.1f} s {point['bytes'] / 1e6:8.1f} MB  {point['label']}")
-print("\n".join(result["remarks"]))
+print("\n".join([*result["remarks"], *result["undecided"]]))
 best = min(result["points"], key=lambda p: p["error"])
 if best["error"] > limit:
     sys.exit(f"failed: the least error is {best['error']:.2%} ({best['label']}), more than {limit:.2%}")

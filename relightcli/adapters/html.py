@@ -23,6 +23,7 @@ figcaption { font-size: 0.9rem; }
 table { border-collapse: collapse; margin: 1rem 0; }
 th, td { padding: 0.25rem 0.75rem; border-bottom: 1px solid #8886; text-align: left; overflow-wrap: anywhere; }
 th { overflow-wrap: normal; }
+td:not(.number) { min-width: 6rem; }
 td.number { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }
 """
 
@@ -106,4 +107,5 @@ def _table(table: Table) -> str:
 def _cell(value: str | int | float) -> str:
     if isinstance(value, str):
         return f"<td>{escape(value)}</td>"
-    return f'<td class="number">{value:.4g}</td>' if isinstance(value, float) else f'<td class="number">{value}</td>'
+    text = str(value) if isinstance(value, int) else f"{value:.4g}" if abs(value) < 1e4 else f"{value:.0f}"
+    return f'<td class="number">{text}</td>'

@@ -69,4 +69,6 @@ def _text(result: dict[str, Any], table: str) -> str:
         total = f"{result['predicted_seconds']:.0f} s predicted for the simulations, {result['repeats']} times each"
         return "\n".join([*lines, f"{total}; stages after precompute, pictures and path tracing come on top"])
     what = "is up to date" if result["status"] == "up to date" else f"{result['commands_run']} commands run"
-    return "\n".join([table, *result["remarks"], f"{result['report']}: {what}; the page is index.html in it"])
+    return "\n".join(
+        [table, *result["remarks"], *result["undecided"], f"{result['report']}: {what}; the page is index.html in it"]
+    )

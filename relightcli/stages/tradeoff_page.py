@@ -85,14 +85,17 @@ def _page(
 ) -> str:
     intro = (
         f"{len(result.points)} points of {result.scene}, seen as {'; '.join(result.views)}. "
-        f"Errors are relative RMS of radiance over whole pictures, against path tracing of {result.bounces} "
-        f"interreflections with {result.spp} samples a pixel, whose noise is taken off; ± is what that noise still "
+        f"Errors are relative RMS of radiance over whole pictures, against path tracing (interreflections: "
+        f"{result.bounces}, samples a pixel: {result.spp}), whose noise is taken off; ± is what that noise still "
         f"leaves open. Times are of {result.machine}, {result.workers} workers, and hold there only."
     )
     exposure = auto_exposure(reference.pixels)
     shown = [Picture(_small(s.pixels, exposure), s.caption) for s in (*pictures, reference)]
     sections = [
         Section("What was found", "\n\n".join(result.remarks())),
+        Section(
+            "What the measurement leaves open", "\n\n".join(result.undecided() or ["Nothing of what is told here."])
+        ),
         Section(
             "Error against cost",
             "Numbers are those of the table. Filled points are the front: no other has both less error and less cost. "
@@ -103,7 +106,7 @@ def _page(
             "All points",
             "Seconds are the least of the repeats. Memory is that of the largest process. A dominated point is nowhere "
             "better than the one named, in error, time or bytes.",
-            tables=[Table(list(HEADER), rows(result)), _costs(result)],
+            tables=[_points(result), _costs(result), _path_tracing(result)],
         ),
         Section(
             "Error budget",
@@ -121,6 +124,16 @@ def _page(
         ),
     ]
     return page("relightcli tradeoff", intro, sections)
+
+
+def _points(result: Result) -> Table:
+    """The table of the terminal, its numbers rounded alike."""
+    forms = HEADER.values()
+    shown = [
+        [float(f"{cell:{form}}") if isinstance(cell, float) else cell for cell, form in zip(row, forms, strict=True)]
+        for row in rows(result)
+    ]
+    return Table(list(HEADER), shown)
 
 
 def _costs(result: Result) -> Table:
@@ -146,8 +159,12 @@ def _costs(result: Result) -> Table:
                 "never" if gain.pictures is None else gain.pictures,
             ]
         )
-    traced = ", ".join(f"{t.spp} spp {100 * t.error:.2f} % {t.seconds:.2f} s" for t in result.traced)
-    return Table(header, [*lines, ["", f"path tracing: {traced}", *[""] * 7]])
+    return Table(header, lines)
+
+
+def _path_tracing(result: Result) -> Table:
+    header = ("path tracing, samples a pixel", "error %", "seconds a picture")
+    return Table(header, [[t.spp, 100 * t.error, t.seconds] for t in result.traced])
 
 
 def _budget(result: Result) -> Table:

@@ -131,7 +131,7 @@ class Result:
         return min(fine, key=lambda k: (self.points[k].seconds, k), default=None)
 
     def remarks(self) -> list[str]:
-        """What the numbers say, and what they do not: a line each."""
+        """What the numbers say: a line each."""
         points = self.points
         lines = []
         best = self.cheapest()
@@ -151,7 +151,6 @@ class Result:
         for k, by in enumerate(self.dominated_by()):
             if by is not None:
                 lines.append(f"{points[k].label} is dominated by {points[by].label}: nowhere better, somewhere worse.")
-        lines += self._not_told_apart()
         lines += [f"{label} could not be made: {why}" for label, why in self.impossible.items()]
         return lines
 
@@ -162,8 +161,8 @@ class Result:
         found += [(k, by) for k, by in enumerate(self.dominated_by()) if by is not None]
         return sorted({(min(pair), max(pair)) for pair in found})
 
-    def _not_told_apart(self) -> list[str]:
-        """Pairs that differ by less than repeats of one point do, or than the references' noise."""
+    def undecided(self) -> list[str]:
+        """A line for pairs that differ by less than repeats of one point do, or than the references' noise."""
         lines = []
         for i, j in self.pairs():
             p, q = self.points[i], self.points[j]
@@ -210,6 +209,7 @@ class Result:
             "path_tracing": [asdict(t) for t in self.traced],
             "impossible": self.impossible,
             "remarks": self.remarks(),
+            "undecided": self.undecided(),
         }
 
 

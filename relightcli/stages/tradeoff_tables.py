@@ -75,7 +75,7 @@ HEADER = {
 
 
 def rows(result: Result) -> list[list[str | int | float]]:
-    """The table, in the order of HEADER."""
+    """The table, in the order of HEADER, not rounded."""
     fronts, by = result.fronts(), result.dominated_by()
     return [
         [

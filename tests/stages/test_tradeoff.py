@@ -168,7 +168,13 @@ def test_the_page_holds_everything_in_itself(scene, report):
     fronts = sum(bool(p["front"]) for p in report["points"])
     assert len(sources) == 4 + fronts + 1
     assert all(s.startswith("data:image/") for s in sources)
-    for part in (*report["remarks"], "relightcli tradeoff scene.toml", "--bounces 0", "light-resolution=32"):
+    for part in (
+        *report["remarks"],
+        *report["undecided"],
+        "relightcli tradeoff scene.toml",
+        "--bounces 0",
+        "light-resolution=32",
+    ):
         assert html.escape(part) in page
     for name in report["files"]:
         assert (scene / "report" / name).stat().st_size > 100

@@ -80,9 +80,9 @@ def test_path_tracing_at_equal_error():
 def test_differences_below_the_spread_of_repeats_are_not_told_apart():
     apart = "which is faster is not known"
     # The two points are neighbours on the front; 3 s between them.
-    told = result(point("a", 0.02, 10, spread=1), point("b", 0.01, 13, spread=1)).remarks()
+    told = result(point("a", 0.02, 10, spread=1), point("b", 0.01, 13, spread=1)).undecided()
     assert not any(apart in line for line in told)
-    vague = result(point("a", 0.02, 10, spread=5), point("b", 0.01, 13, spread=1)).remarks()
+    vague = result(point("a", 0.02, 10, spread=5), point("b", 0.01, 13, spread=1)).undecided()
     assert (
         "a and b: the seconds of simulation differ by 3, those of repeats by 5; which is faster is not known." in vague
     )
@@ -92,8 +92,8 @@ def test_errors_below_the_noise_are_not_told_apart():
     pair = (point("a", 0.0101, 10), point("b", 0.01, 13))
     apart = "which is more exact is not known"
     # 0.0101^2 - 0.01^2 = 2.01e-6.
-    assert any(apart in line for line in result(*pair, pair_noise={(0, 1): 3e-6}).remarks())
-    assert not any(apart in line for line in result(*pair, pair_noise={(0, 1): 1e-6}).remarks())
+    assert any(apart in line for line in result(*pair, pair_noise={(0, 1): 3e-6}).undecided())
+    assert not any(apart in line for line in result(*pair, pair_noise={(0, 1): 1e-6}).undecided())
 
 
 def test_pictures_become_one_error():
