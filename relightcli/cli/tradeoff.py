@@ -29,7 +29,7 @@ from relightcli.cli import options
     "--bounces", default=2, show_default=True, type=click.IntRange(0, 64), help="Interreflections of the truth."
 )
 @click.option(
-    "--spp", default=256, show_default=True, type=click.IntRange(2, 1 << 20), help="Samples a pixel of the truth."
+    "--spp", default=64, show_default=True, type=click.IntRange(2, 1 << 20), help="Samples a pixel of the truth."
 )
 @click.option(
     "--repeats", default=2, show_default=True, type=click.IntRange(1, 100), help="Times that each point is run."

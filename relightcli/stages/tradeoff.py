@@ -27,7 +27,7 @@ def tradeoff(config: Config) -> dict[str, Any]:
     scene = load_scene(config.scene, allow_outside=config.allow_outside)
     cameras = [resolve_camera(name, scene.cameras).name for name in dict.fromkeys(config.cameras or (None,))]
     camera = cameras[0] if len(cameras) == 1 else None
-    knobs = parse_knobs(config.knobs) if config.knobs else default_knobs(config.bounces, camera)
+    knobs = parse_knobs(config.knobs) if config.knobs else default_knobs(config.bounces)
     points = expand(knobs, config.bounces, camera)
     _check_cameras(points, cameras)
     if config.dry_run:

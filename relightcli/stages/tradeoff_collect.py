@@ -49,6 +49,7 @@ def collect(
         points=tuple(measured),
         traced=tuple(_traced(config, runs, spp, views, truths) for spp in traced),
         impossible=dict(impossible),
+        looks={view.name: _look(config, view) for view in views},
     )
     noise = {}
     for i, j in result.pairs():
@@ -68,6 +69,16 @@ def collect(
 def _truth(config: Config, runs: Runs, view: View) -> Truth:
     a, b = (runs.reference(view, config.spp // 2, config.seed + k, config.bounces)[0] for k in (0, 1))
     return read_truth(view.name, a, b)
+
+
+def _look(config: Config, view: View) -> list[list[str]]:
+    """The commands of a picture from a store, and of one half of the truth."""
+    seen = ["--env", view.environment, "--camera", view.camera, "--layers"]
+    truth = ["--reference", "--spp", str(config.spp // 2), "--bounces", str(config.bounces)]
+    return [
+        ["relightcli", "relight", "transfer.zarr", "-o", "picture.exr", *seen],
+        ["relightcli", "relight", str(config.scene), "-o", "truth.exr", *seen, *truth, "--seed", str(config.seed)],
+    ]
 
 
 def _measured(

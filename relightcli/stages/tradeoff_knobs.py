@@ -82,12 +82,10 @@ def expand(asked: Mapping[str, Sequence[str]], bounces: int, camera: str | None)
     return [_point(settings, base) for settings in wanted]
 
 
-def default_knobs(bounces: int, camera: str | None) -> dict[str, list[str]]:
+def default_knobs(bounces: int) -> dict[str, list[str]]:
     """A small sweep around what the commands do by default."""
-    knobs = {"light-resolution": ["64", "32", "16"], "refine": ["4", "8"]}
-    knobs["receivers"] = ["vertices"] if camera is None else ["vertices", f"pixels:{camera}"]
-    knobs["bounces"] = [str(k) for k in range(bounces, -1, -1)]
-    return knobs
+    fewer = [str(k) for k in range(bounces, -1, -1)]
+    return {"light-resolution": ["64", "32", "16"], "refine": ["4", "8"], "bounces": fewer}
 
 
 def parse_knobs(texts: Sequence[str]) -> dict[str, list[str]]:

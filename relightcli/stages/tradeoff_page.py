@@ -118,9 +118,7 @@ def _page(
         Section(
             "How to repeat it",
             shlex.join(command),
-            tables=[
-                Table(("point", "commands"), [(p.label, "; ".join(map(shlex.join, p.commands))) for p in result.points])
-            ],
+            tables=[_commands(result)],
         ),
     ]
     return page("relightcli tradeoff", intro, sections)
@@ -176,6 +174,13 @@ def _budget(result: Result) -> Table:
         own = [100 * p.error.own[n] if n in p.error.own else "-" for n in layers]
         lines.append([k + 1, p.label, *share, *own])
     return Table(header, lines)
+
+
+def _commands(result: Result) -> Table:
+    """What a user types to have a point's store, its pictures, and the truth."""
+    lines = [(p.label, "; ".join(map(shlex.join, p.commands))) for p in result.points]
+    lines += [(f"{name}: picture and truth", "; ".join(map(shlex.join, made))) for name, made in result.looks.items()]
+    return Table(("what", "commands"), lines)
 
 
 def _alt(name: str) -> str:

@@ -94,8 +94,13 @@ def ahead(point: Measured, tracer: Tracer) -> Ahead:
 
 @dataclass(frozen=True)
 class Result:
-    """The whole answer. views: names; impossible: label -> why a point could not be made; pair_noise: for
-    `pairs`, the standard error of the difference of their squared errors."""
+    """The whole answer.
+
+    views       names
+    impossible  label -> why a point could not be made
+    looks       view -> the commands of its pictures, for the reader
+    pair_noise  for `pairs`: the standard error of the difference of their squared errors
+    """
 
     scene: str
     views: tuple[str, ...]
@@ -107,6 +112,7 @@ class Result:
     points: tuple[Measured, ...]
     traced: tuple[Traced, ...]
     impossible: dict[str, str]
+    looks: Mapping[str, Sequence[Sequence[str]]] = field(default_factory=dict)
     pair_noise: Mapping[tuple[int, int], float] = field(default_factory=dict)
 
     def fronts(self) -> dict[str, list[int]]:

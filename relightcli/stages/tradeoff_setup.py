@@ -31,7 +31,7 @@ class Config:
     envs: tuple[str, ...] = ()
     cameras: tuple[str, ...] = ()
     bounces: int = 2
-    spp: int = 256
+    spp: int = 64
     repeats: int = 2
     tolerance: float | None = None
     seed: int = 0
@@ -106,7 +106,9 @@ def make_views(config: Config, scene: Scene, cameras: list[str]) -> list[View]:
     if not files:
         files = {"built-in sky": _built_in_sky(config.output)}
     return [
-        View(Path(name).stem if Path(name).suffix else name, str(path), formats.fingerprint_file(path), camera)
+        View(
+            Path(name).stem if Path(name).suffix else name, str(path.resolve()), formats.fingerprint_file(path), camera
+        )
         for name, path in files.items()
         for camera in cameras
     ]
