@@ -104,7 +104,8 @@ def _page(
         ),
         Section(
             "All points",
-            "Seconds are the least of the repeats. Memory is that of the largest process. A dominated point is nowhere "
+            "Seconds are the least of the repeats. Memory is that of the largest process. FLIP counts the noise of the "
+            "references too. A dominated point is nowhere "
             "better than the one named, in error, time or bytes.",
             tables=[_points(result), _costs(result), _path_tracing(result)],
         ),

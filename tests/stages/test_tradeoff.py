@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import html
 import io
 import json
@@ -13,14 +14,19 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from relightcli.adapters.images import read_environment
 from relightcli.cli.main import run
 from relightcli.core.lights.sky import sky_latlong
+from relightcli.errors import StoreError
 from relightcli.scene.model import Camera, Material
+from relightcli.scene.parse import load_scene
+from relightcli.stages.tradeoff_setup import Config, machine, make_views, open_folder
 from tests.core.transport.scenes import lambert, sphere, square
 from tests.stages.scene_files import write_scene
 
@@ -32,46 +38,60 @@ SWEEP += ("--bounces", "1", "--spp", "128", "--repeats", "1", "--env", "sky", "-
 
 def program(folder, *more, output="report"):
     command = [sys.executable, "-m", "relightcli", "tradeoff", "scene.toml", "-o", output, *SWEEP, *more]
-    return subprocess.run(command, cwd=folder, env=ENVIRONMENT, capture_output=True, text=True, timeout=300)
+    return subprocess.run(command, cwd=folder, env=ENVIRONMENT, capture_output=True, text=True, timeout=600)
 
 
 def records(folder):
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.glob("report/runs/**/record.json")}
+    return {str(p.relative_to(folder)): p.read_text() for p in folder.glob("report/runs/**/record.json")}
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory):
+def sweep(tmp_path_factory):
+    """Folder of the scene and its report; records of a sweep that was killed once its first command had ended; the
+    answer of the same command run again. Test processes that run side by side share one."""
+    base = tmp_path_factory.getbasetemp()
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    folder = base / "tradeoff-sweep"
+    with open(base / "tradeoff-sweep.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "told.json").exists():
+            (folder / "told.json").write_text(json.dumps(_sweep(folder)))
+    killed, answer = json.loads((folder / "told.json").read_text())
+    return folder, killed, answer
+
+
+def _sweep(folder):
     parts = {
         "ground": square(3, material=lambert(0.6)),
         "ball": sphere(0.5, (0, 0.6, 0), rings=16, material=Material("ball", "blinn-phong", specular=(0.3, 0.3, 0.3))),
     }
     maps = {"sky": sky_latlong(45.0, overcast=True), "sun": np.ones((2, 4, 3))}
-    camera = Camera("main", (0, 1.5, 3), (0, 0.4, 0), size=(32, 24))
-    return write_scene(tmp_path_factory.mktemp("sweep"), parts, [camera], maps).parent
-
-
-@pytest.fixture(scope="module")
-def killed(scene):
-    """Records of a sweep that was killed once its first command had ended."""
+    write_scene(folder, parts, [Camera("main", (0, 1.5, 3), (0, 0.4, 0), size=(32, 24))], maps)
     command = [sys.executable, "-m", "relightcli", "tradeoff", "scene.toml", "-o", "report", *SWEEP]
-    with subprocess.Popen(command, cwd=scene, env=ENVIRONMENT, stderr=subprocess.DEVNULL) as process:
+    with subprocess.Popen(command, cwd=folder, env=ENVIRONMENT, stderr=subprocess.DEVNULL) as process:
         deadline = time.monotonic() + 240
-        while not records(scene) and time.monotonic() < deadline and process.poll() is None:
+        while not records(folder) and time.monotonic() < deadline and process.poll() is None:
             time.sleep(0.05)
         process.kill()
     assert process.returncode == -signal.SIGKILL
-    return records(scene)
-
-
-@pytest.fixture(scope="module")
-def report(scene, killed):
-    """The answer of the same command run again."""
-    done = program(scene, "--json")
+    killed = records(folder)
+    done = program(folder, "--json")
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return killed, json.loads(done.stdout)
 
 
-def test_a_killed_sweep_goes_on_and_runs_nothing_twice(scene, killed, report):
+@pytest.fixture
+def scene(sweep):
+    return sweep[0]
+
+
+@pytest.fixture
+def report(sweep):
+    return sweep[2]
+
+
+def test_a_killed_sweep_goes_on_and_runs_nothing_twice(sweep):
+    scene, killed, report = sweep
     assert killed
     now = records(scene)
     assert {name: now[name] for name in killed} == killed
@@ -127,6 +147,29 @@ def test_a_finished_sweep_runs_nothing_and_another_scene_is_refused(scene, repor
     assert refused.returncode == 3
     assert "another scene" in refused.stderr
     assert "--overwrite" in refused.stderr
+
+
+def test_overwrite_starts_a_report_of_something_else_anew(scene, tmp_path):
+    folder = tmp_path / "old"
+    (folder / "runs" / "precompute-0").mkdir(parents=True)
+    (folder / "tradeoff.json").write_text('{"format": 1}')
+    loaded = load_scene(scene / "scene.toml")
+    config = Config(scene / "scene.toml", folder)
+    with pytest.raises(StoreError, match="another program, scene, machine, workers"):
+        open_folder(config, loaded)
+    assert (folder / "runs" / "precompute-0").exists()
+    open_folder(replace(config, overwrite=True), loaded)
+    assert not (folder / "runs").exists()
+    (folder / "runs").mkdir()
+    assert open_folder(config, loaded) == machine()
+    assert (folder / "runs").exists()
+
+
+def test_a_scene_without_skies_gets_one(scene, tmp_path):
+    loaded = replace(load_scene(scene / "scene.toml"), environments={})
+    (view,) = make_views(Config(scene / "scene.toml", tmp_path), loaded, ["main"])
+    assert view.name == "built-in sky, main"
+    assert read_environment(view.environment).max() > 0
 
 
 def test_bad_usage_is_refused_before_anything_runs(scene, tmp_path, monkeypatch, capsys):
