@@ -40,6 +40,8 @@ def scatter(
     with matplotlib.rc_context({"svg.hashsalt": "relightcli", "font.size": 10}):
         figure = _figure(title, x_name, y_name)
         axes = figure.axes[0]
+        axes.set_xlim(*_limits([*x, *(curve.x if curve else [])]))
+        axes.set_ylim(*_limits([*y, *(curve.y if curve else []), *([level[1]] if level else [])]))
         other = [k for k in range(len(x)) if k not in front]
         axes.step(
             [x[k] for k in front], [y[k] for k in front], where="post", color="#1f5fa8", linewidth=1.2, label="front"
@@ -55,6 +57,11 @@ def scatter(
             axes.axhline(level[1], color="#3a8a4d", linewidth=1, linestyle=":", label=level[0])
         axes.legend(frameon=False, fontsize=9)
         return _bytes(figure)
+
+
+def _limits(values: Sequence[float]) -> tuple[float, float]:
+    """Room around the values on a logarithmic axis, also where they are all one."""
+    return min(values) / 1.4, max(values) * 1.4
 
 
 def bars(title: str, y_name: str, names: Sequence[str], parts: dict[str, Sequence[float]]) -> dict[str, bytes]:

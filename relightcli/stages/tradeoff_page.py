@@ -24,7 +24,6 @@ _AXIS_NAMES = {
     "frame_seconds": "seconds of a further frame",
     "bytes": "MB of the store",
 }
-_LEAST = 1e-7  # errors that plots cannot show on a logarithmic axis
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,8 @@ def write_report(
 def _plots(result: Result) -> dict[str, dict[str, bytes]]:
     """A plot per axis, and the error budget of the points on the fronts."""
     fronts = result.fronts()
-    errors = [100 * max(p.error.error, _LEAST) for p in result.points]
+    # An error below its own noise is shown at the noise: nothing is known below, and the axis is logarithmic.
+    errors = [100 * max(p.error.error, p.error.noise, 1e-9) for p in result.points]
     level = (f"tolerance, {100 * result.tolerance:g} %", 100 * result.tolerance)
     traced = Curve(
         "path tracing, a picture", [t.seconds for t in result.traced], [100 * t.error for t in result.traced]
@@ -99,7 +99,7 @@ def _page(
         Section(
             "Error against cost",
             "Numbers are those of the table. Filled points are the front: no other has both less error and less cost. "
-            "Crosses: path tracing, at the error of its own variance.",
+            "Crosses: path tracing, at the error of its own variance. Errors below their noise are drawn at the noise.",
             [Picture(data_uri(plot["svg"], "image/svg+xml"), _alt(name)) for name, plot in plots.items()],
         ),
         Section(

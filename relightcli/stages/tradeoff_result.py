@@ -132,33 +132,36 @@ class Result:
         return fit_tracer(self.traced)
 
     def cheapest(self) -> int | None:
-        """The point within the tolerance whose store takes the least time."""
-        fine = [k for k, p in enumerate(self.points) if p.error.error <= self.tolerance]
+        """The point whose store takes the least time of those within the tolerance, the error's noise included."""
+        fine = [k for k, p in enumerate(self.points) if p.error.error + p.error.noise <= self.tolerance]
         return min(fine, key=lambda k: (self.points[k].seconds, k), default=None)
 
     def remarks(self) -> list[str]:
         """What the numbers say: a line each."""
         points = self.points
-        lines = []
         best = self.cheapest()
-        if best is None:
-            k = min(range(len(points)), key=lambda i: points[i].error.error)
-            lines.append(
-                f"No point keeps the error under {self.tolerance:.2%}; the least is {points[k].error.error:.2%}: "
-                f"{points[k].label}."
-            )
-        else:
-            p = points[best]
-            lines.append(
-                f"The cheapest point with an error of at most {self.tolerance:.2%} is: {p.label} "
-                f"({p.error.error:.2%}, {p.seconds:.1f} s, {p.bytes / 1e6:.1f} MB)."
-            )
+        lines = [self._within_tolerance(best)]
         lines += [_ahead_text(p, ahead(p, self.tracer())) for p in ([points[best]] if best is not None else points[:1])]
         for k, by in enumerate(self.dominated_by()):
             if by is not None:
                 lines.append(f"{points[k].label} is dominated by {points[by].label}: nowhere better, somewhere worse.")
         lines += [f"{label} could not be made: {why}" for label, why in self.impossible.items()]
         return lines
+
+    def _within_tolerance(self, best: int | None) -> str:
+        if best is not None:
+            p = self.points[best]
+            return (
+                f"The cheapest point with an error of at most {self.tolerance:.2%} is: {p.label} "
+                f"({p.error.error:.2%}, {p.seconds:.1f} s, {p.bytes / 1e6:.1f} MB)."
+            )
+        p = min(self.points, key=lambda q: q.error.error)
+        if p.error.error <= self.tolerance:
+            return (
+                f"Whether a point keeps the error under {self.tolerance:.2%} is not known: that of {p.label} is "
+                f"{p.error.error:.2%} or up to {p.error.noise:.2%} more. A larger --spp would tell."
+            )
+        return f"No point keeps the error under {self.tolerance:.2%}; the least is {p.error.error:.2%}: {p.label}."
 
     def pairs(self) -> list[tuple[int, int]]:
         """Points whose order is told: neighbours on a front of time, and dominated ones with what dominates them."""

@@ -39,6 +39,11 @@ def test_points_of_the_front_are_filled_and_others_are_not(plot):
     assert blue(plot["png"]) > 1.5 * blue(one["png"]) > 0
 
 
+def test_points_that_are_all_one_still_make_a_plot():
+    assert set(scatter("T", "s", "e", [1.0], [2.0], [0])) == {"png", "svg"}
+    assert set(scatter("T", "s", "e", [3.0, 3.0], [2.0, 2.0], [0, 1])) == {"png", "svg"}
+
+
 def test_bars():
     found = bars("T", "%", ["#1", "#2"], {"direct": [1.0, 2.0], "specular": [0.0, 0.5]})
     assert set(found) == {"png", "svg"}

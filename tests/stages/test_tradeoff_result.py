@@ -55,6 +55,10 @@ def test_the_cheapest_point_within_the_tolerance():
     points = (point("base", 0.015, 20), point("fast", 0.0199, 10), point("bad", 0.021, 1))
     assert result(*points).cheapest() == 1
     assert "is: fast (1.99%, 10.0 s, 1.0 MB)" in result(*points).remarks()[0]
+    # The noise of the fast one's error could take it past the tolerance.
+    vague = (points[0], point("fast", 0.0199, 10, noise=0.0002), points[2])
+    assert result(*vague).cheapest() == 0
+    assert "is not known: that of fast is 1.99% or up to 0.02% more" in result(vague[1]).remarks()[0]
     none = result(*points, tolerance=0.001)
     assert none.cheapest() is None
     assert "No point keeps the error under 0.10%; the least is 1.50%: base." in none.remarks()
