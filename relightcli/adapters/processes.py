@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -14,8 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 PATIENCE = 10.0  # seconds that an interrupted program gets to put things in order
-_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG
-_LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
+# A small interpreter asks for SIGTERM (15) at its caller's death (PR_SET_PDEATHSIG, 1) and becomes the program. Python
+# code between fork and exec would do the same, but is not safe in a process with threads.
+_BOUND = (
+    "import ctypes, os, sys; ctypes.CDLL(None).prctl(1, 15);"
+    "os.getppid() == int(sys.argv[1]) or sys.exit(1); os.execvp(sys.argv[2], sys.argv[2:])"
+)
 
 
 @dataclass(frozen=True)
@@ -33,17 +35,14 @@ class Finished:
 def run_program(command: Sequence[str]) -> Finished:
     """Runs a program to its end, without input. An interrupt ends it too; so does, on Linux, the caller's death.
 
-    The kernel counts the caller's memory at the fork into the peak: call this from a process smaller than the program.
+    On Linux its seconds include the start of an interpreter without modules, some hundredths. The kernel may count the
+    caller's memory at the fork into the peak: call this from a process smaller than the program.
     """
+    if sys.platform == "linux":
+        command = [sys.executable, "-I", "-S", "-c", _BOUND, str(os.getpid()), *command]
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         started = time.perf_counter()
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=out,
-            stderr=err,
-            preexec_fn=None if _LIBC is None else _die_with_parent,
-        )
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=out, stderr=err)
         try:
             _, status, usage = os.wait4(process.pid, 0)
         except BaseException:
@@ -62,11 +61,6 @@ def run_program(command: Sequence[str]) -> Finished:
             out.read().decode("utf-8", "replace"),
             err.read().decode("utf-8", "replace"),
         )
-
-
-def _die_with_parent() -> None:
-    assert _LIBC is not None
-    _LIBC.prctl(_DEATH_SIGNAL, signal.SIGTERM)
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

@@ -117,7 +117,6 @@ class _Progress:
         if not quiet and sys.stderr.isatty():
             from tqdm import tqdm
 
-            tqdm.monitor_interval = 0  # no thread beside this one, which starts processes
             self._bar = tqdm(total=total, unit="step", file=sys.stderr)
 
     def __enter__(self) -> _Progress:
