@@ -29,7 +29,7 @@ def tradeoff(config: Config) -> dict[str, Any]:
     camera = cameras[0] if len(cameras) == 1 else None
     knobs = parse_knobs(config.knobs) if config.knobs else default_knobs(config.bounces)
     points = expand(knobs, config.bounces, camera)
-    _check_cameras(points, cameras)
+    _check_points(points, cameras, config.bounces)
     if config.dry_run:
         return _dry_run(config, points, camera)
     lock = Lock(config.output)  # held until the report is written
@@ -66,9 +66,17 @@ def _check(config: Config) -> None:
         raise InputError(f"--tolerance: expected more than 0 and less than 1; found {config.tolerance}")
 
 
-def _check_cameras(points: list[Point], cameras: list[str]) -> None:
+def _check_points(points: list[Point], cameras: list[str], bounces: int) -> None:
+    """Raises InputError for points that the truth or the views of the sweep cannot judge."""
     for point in points:
-        receivers = dict(point.settings).get("receivers", "vertices")
+        settings = dict(point.settings)
+        if int(settings["bounces"]) > bounces:
+            raise InputError(
+                f"--knob bounces={settings['bounces']}: more than the truth has; expected at most --bounces {bounces}"
+            )
+        if settings.get("store") == "lights" and len(cameras) > 1:
+            raise InputError("--knob store=lights: keeps specular lobes for one view; expected one --camera")
+        receivers = settings.get("receivers", "vertices")
         if receivers != "vertices" and cameras != [receivers.removeprefix("pixels:")]:
             raise InputError(
                 f"--knob receivers={receivers}: such a store shows no other camera, and the sweep is judged by "

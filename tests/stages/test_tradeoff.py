@@ -182,6 +182,7 @@ def test_bad_usage_is_refused_before_anything_runs(scene, tmp_path, monkeypatch,
         (("--spp", "33"), "new", "--spp"),
         (("--tolerance", "2"), "new", "--tolerance"),
         (("--camera", "none"), "new", "--camera none"),
+        (("--bounces", "0"), "new", "more than the truth has; expected at most --bounces 0"),
         (("--knob", "receivers=pixels:other"), "new", "no other camera"),
         ((), str(folder), "expected an empty folder"),
     ):
