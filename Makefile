@@ -1,9 +1,9 @@
-# make demo | test | lint | bench | recipes | clean. Each sets up what it needs in .venv.
+# make demo | tradeoff | test | lint | bench | recipes | clean. Each sets up what it needs in .venv.
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: demo test lint bench recipes clean
+.PHONY: demo tradeoff test lint bench recipes clean
 
 $(VENV)/.base: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -26,6 +26,9 @@ $(VENV)/.bench: $(VENV)/.base
 demo: $(VENV)/.base  ## the main job on a built-in scene; leaves demo/index.html
 	$(MAKE) --no-print-directory -C recipes/demo RELIGHTCLI=$(abspath $(BIN))/relightcli PYTHON=$(abspath $(BIN))/python OUT=$(abspath demo)
 
+tradeoff: $(VENV)/.base  ## what accuracy costs on the built-in scene; leaves tradeoff/report/index.html
+	$(MAKE) --no-print-directory -C recipes/tradeoff RELIGHTCLI=$(abspath $(BIN))/relightcli PYTHON=$(abspath $(BIN))/python OUT=$(abspath tradeoff)
+
 test: $(VENV)/.test
 	$(BIN)/python -m pytest -q -n auto --dist worksteal --durations 25
 
@@ -43,5 +46,5 @@ recipes: $(VENV)/.base  ## every recipe end to end; each ends in a check
 	done
 
 clean:
-	rm -rf $(VENV) demo build
+	rm -rf $(VENV) demo tradeoff build
 	find relightcli -name '*.nb[ic]' -delete  # compiled loops: a change in another file does not renew them

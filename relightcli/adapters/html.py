@@ -22,7 +22,9 @@ figcaption { font-size: 0.9rem; }
 .table { overflow-x: auto; }
 table { border-collapse: collapse; margin: 1rem 0; }
 th, td { padding: 0.25rem 0.75rem; border-bottom: 1px solid #8886; text-align: left; overflow-wrap: anywhere; }
-td.number { text-align: right; font-variant-numeric: tabular-nums; }
+th { overflow-wrap: normal; }
+td:not(.number) { min-width: 6rem; }
+td.number { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }
 """
 
 
@@ -71,13 +73,18 @@ def page(title: str, intro: str, sections: Sequence[Section]) -> str:
     return head + "\n".join(part for part in body if part) + "\n</body>\n</html>\n"
 
 
+def data_uri(data: bytes, kind: str) -> str:
+    """A file inside the page. kind: its media type, e.g. image/svg+xml."""
+    return f"data:{kind};base64," + base64.b64encode(data).decode("ascii")
+
+
 def png_data_uri(display: NDArray[np.uint8]) -> str:
     """A PNG inside the page. display (H, W, 3) or (H, W, 4) uint8, sRGB."""
     from PIL import Image
 
     stream = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(display)).save(stream, "PNG")
-    return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
+    return data_uri(stream.getvalue(), "image/png")
 
 
 def _paragraphs(text: str) -> str:
@@ -100,4 +107,5 @@ def _table(table: Table) -> str:
 def _cell(value: str | int | float) -> str:
     if isinstance(value, str):
         return f"<td>{escape(value)}</td>"
-    return f'<td class="number">{value:.4g}</td>' if isinstance(value, float) else f'<td class="number">{value}</td>'
+    text = str(value) if isinstance(value, int) else f"{value:.4g}" if abs(value) < 1e4 else f"{value:.0f}"
+    return f'<td class="number">{text}</td>'

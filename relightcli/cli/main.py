@@ -25,6 +25,7 @@ COMMANDS = {
     "fit-pose": "Learn from a transfer store what skinned objects see in any pose.",
     "relight": "Make pictures from a store: new sky, camera, materials, sequences.",
     "diff": "Compare images, sequences or stores; exit 1 when they differ too much.",
+    "tradeoff": "Measure what accuracy costs in time and bytes, as table, plots and page.",
     "inspect": "Show what a store holds, what it cost, and whether it is sound.",
 }
 

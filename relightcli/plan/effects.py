@@ -1,9 +1,9 @@
 """Which effects a scene calls for, with the evidence.
 
-Names follow interface.md: direct, shadows, one-bounce, two-bounce, specular, fields, pose. This version does not
-Left to itself (`auto`) the plan asks structure
-first (nothing can block anything), then a pilot (`plan.pilot`): an effect is skipped where leaving it out costs less
-than SKIPPED of the tolerance. Specular lobes cost nothing here: they are integrated when a picture is made.
+Names follow interface.md: direct, shadows, one-bounce, two-bounce, specular, fields, pose. Left to itself (`auto`) the
+plan asks structure first (nothing can block anything), then a pilot (`plan.pilot`): an effect is skipped where leaving
+it out costs less than SKIPPED of the tolerance. Specular lobes cost nothing here: they are integrated when a picture is
+made.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from relightcli.errors import InputError
 from relightcli.plan.pilot import Share
 
-KNOWN = ("direct", "shadows", "one-bounce", "two-bounce", "specular", "fields", "pose")
 AVAILABLE = ("direct", "shadows", "one-bounce", "two-bounce", "specular", "fields", "pose")
 BOUNCES = {"one-bounce": 1, "two-bounce": 2}
 SKIPPED = 0.5  # of the tolerance: what effects that are left out may cost together
@@ -45,19 +44,15 @@ class Pilot(Protocol):
 
 
 def parse_effects(text: str) -> tuple[str, ...] | None:
-    """The effects named by `--effects`; None for `auto`. Raises InputError for what is unknown or not there yet."""
+    """The effects named by `--effects`; None for `auto`. Raises InputError for what is unknown."""
     if text == "auto":
         return None
     if text == "all":
         return AVAILABLE
     names = tuple(name.strip() for name in text.split(","))
     for name in names:
-        if name not in KNOWN:
-            raise InputError(f"--effects: expected auto, all or names out of {', '.join(KNOWN)}; found {name!r}")
         if name not in AVAILABLE:
-            raise InputError(
-                f"--effects: {name!r} is not simulated by this version; expected names out of {', '.join(AVAILABLE)}"
-            )
+            raise InputError(f"--effects: expected auto, all or names out of {', '.join(AVAILABLE)}; found {name!r}")
     if "direct" not in names:
         raise InputError("--effects: 'direct' must be among them: every other effect builds on it")
     if "two-bounce" in names and "one-bounce" not in names:

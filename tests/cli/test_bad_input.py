@@ -94,7 +94,6 @@ def test_meshes(here, refused, content, words):
         (("--refine", "8"), ("--refine", "found 8")),  # 16 texels are too few for it
         (("--effects", ""), ("--effects", "direct, shadows", "found ''")),
         (("--effects", "direct,magic"), ("--effects", "found 'magic'")),
-        (("--effects", "direct,fields"), ("--effects", "'fields' is not simulated by this version")),
         (("--effects", "direct,one-bounce"), ("--effects", "'one-bounce' needs 'shadows'")),
         (("--effects", "shadows"), ("--effects", "'direct' must be among them")),
         (("--receivers", "pixels"), ("--receivers", "pixels:CAMERA", "found 'pixels'")),

@@ -36,7 +36,6 @@ def test_names():
     [
         ("caustics", "expected auto, all or names out of direct, .*; found 'caustics'"),
         ("", "found ''"),
-        ("direct,pose", "'pose' is not simulated by this version"),
         ("direct,one-bounce", "'one-bounce' needs 'shadows'"),
         ("direct,shadows,two-bounce", "'two-bounce' needs 'one-bounce'"),
         ("shadows", "'direct' must be among them"),
@@ -205,8 +204,8 @@ def test_decisions_come_with_their_evidence():
     assert shadows(None, both=True).simulate
     assert "both sides" in shadows(None, both=True).evidence
     assert shadows(("direct", "shadows")).simulate
-    moving = {d.effect: d for d in decide(None, BALL, BALL_FACES, False, False, 0, moving=True)}
-    assert moving["shadows"].simulate
+    rows, _ = decide(None, BALL, BALL_FACES, False, False, 0, 0.02, no_pilot, moving=True)
+    assert {row.effect: row for row in rows}["shadows"].simulate
     assert not shadows(("direct",), faces=BALL_FACES[:, ::-1]).simulate
 
 
