@@ -112,13 +112,16 @@ def _object(name: str, table: Table, materials: dict[str, Any]) -> ObjectSpec:
     if material not in materials:
         known = f"one of {', '.join(materials)}" if materials else "a material, and the file defines none"
         table.fail("material", known, did_you_mean(material, materials).strip() or "Define it under [materials].")
+    mesh, motion = table.path("mesh", "a mesh"), table.choice("motion", _MOTIONS, "static")
+    if motion == "skinned" and mesh.suffix.lower() not in (".gltf", ".glb"):
+        table.fail("motion", f"static or rigid for {mesh.name}", "A skin is read from .gltf and .glb files.")
     return ObjectSpec(
         name=name,
-        mesh=table.path("mesh", "a mesh"),
+        mesh=mesh,
         material=material,
         transform=_transform(table),
         two_sided=table.boolean("two_sided", False),
-        motion=cast(MotionName, table.choice("motion", _MOTIONS, "static")),
+        motion=cast(MotionName, motion),
         **_captured(table),
     )
 

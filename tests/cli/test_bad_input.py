@@ -49,7 +49,7 @@ def edit(folder, old, new):
         ("fov = 40.0", "fov = 180", ("cameras.main.fov", "below 180 degrees", "found 180")),
         ("size = [8, 6]", "size = [0, 6]", ("cameras.main.size", "whole numbers", "found [0, 6]")),
         ("map = 'sky-sky.exr'", "map = 'none.exr'", ("environments.sky.map", "no such file")),
-        ("two_sided = false", "motion = 'skinned'", ("objects.ground.motion", "'skinned'", "--effects direct,shadows")),
+        ("two_sided = false", "motion = 'skinned'", ("objects.ground.motion", "'skinned'", ".glb")),
         ("two_sided = false", "translate = [1e300, 0, 0]", ("objects.ground", "beyond 1e+30")),
     ],
 )
