@@ -21,7 +21,7 @@ from relightcli.core.brdf.transport_basis import FUNCTIONS
 from relightcli.core.compress.cpca import cpca
 from relightcli.core.compress.tucker import gram_spectrum
 from relightcli.errors import InputError, StoreError
-from relightcli.stages.lighting import LightingStore
+from relightcli.stages.lighting import LightingStore, need_still
 from relightcli.stages.transfer_setup import BLOCK, CELLS, TransferSetup, coarse_cells
 
 KIND = "clusters"
@@ -56,6 +56,7 @@ def cluster(config: Config) -> dict[str, Any]:
         raise InputError(f"--tolerance: expected more than 0 and less than 1; found {config.tolerance}")
     need_output(config.output)
     lighting = LightingStore(config.store, config.workers)
+    need_still(lighting.store)
     if lighting.store.kind != "transfer":
         raise StoreError(f"{config.store}: expected a store of kind transfer, found {lighting.store.kind}.")
     _need_bounces(lighting)

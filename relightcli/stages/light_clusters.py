@@ -30,7 +30,7 @@ from relightcli.errors import InputError, StoreError
 from relightcli.run import blocks as run
 from relightcli.stages.cluster import copy_arrays
 from relightcli.stages.light_cluster_job import SCRATCH, ClusterJob, ClusterWorker, as_cell
-from relightcli.stages.lighting import SHINY, LightingStore
+from relightcli.stages.lighting import SHINY, LightingStore, need_still
 from relightcli.stages.outputs import resolve_camera
 
 KIND = "light_clusters"
@@ -71,6 +71,7 @@ def cluster_lights(config: Config) -> dict[str, Any]:
     epsilon = _check(config)
     need_output(config.output)
     lighting = LightingStore(config.store, config.workers)
+    need_still(lighting.store)
     if lighting.store.kind != "transfer":
         raise StoreError(f"{config.store}: expected a store of kind transfer, found {lighting.store.kind}.")
     view = _fixed_view(lighting, config.camera)

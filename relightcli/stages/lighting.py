@@ -92,6 +92,15 @@ def read_scene(store: formats.Store) -> tuple[Scene, Geometry]:
     return scene, geometry
 
 
+def need_still(store: formats.Store) -> None:
+    """Raises StoreError for a store whose objects may be moved, which a stage would take for parts of the rest."""
+    if "fields" in store.attrs:
+        raise StoreError(
+            f"{store.path}: holds objects that may be moved, which are simulated apart; expected a store without. "
+            'Precompute with motion = "static", or with --effects direct,shadows.'
+        )
+
+
 class LightingStore:
     """An open transfer store. Reads what it needs when it needs it; keeps small visibility in memory."""
 

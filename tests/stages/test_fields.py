@@ -8,14 +8,18 @@ import pytest
 import relight_formats as formats
 from relightcli.adapters.rays import Tracer
 from relightcli.core.fields.build import build_field
-from relightcli.errors import InputError
+from relightcli.errors import InputError, StoreError
 from relightcli.run import blocks as run
 from relightcli.scene.bodies import own_frame
 from relightcli.scene.model import Camera
 from relightcli.scene.parse import load_scene
 from relightcli.stages import field_store
+from relightcli.stages.cluster import Config as ClusterConfig
+from relightcli.stages.cluster import cluster
 from relightcli.stages.field_store import read_field, read_source
 from relightcli.stages.fields import FieldSettings, find_movers
+from relightcli.stages.light_clusters import Config as LightConfig
+from relightcli.stages.light_clusters import cluster_lights
 from relightcli.stages.relight import Config as RelightConfig
 from relightcli.stages.relight import relight
 from tests.core.transport.scenes import lambert, sphere, square
@@ -211,3 +215,11 @@ def test_dry_run_counts_the_rays_of_fields(scene):
 def test_pictures_of_fields_need_the_reference(store):
     with pytest.raises(InputError, match="with --reference only"):
         relight(RelightConfig(store=store.path, output=str(store.path.parent / "a.exr"), quiet=True))
+
+
+def test_clustering_takes_nothing_that_moves(store):
+    output = store.path.with_name("clusters.zarr")
+    for stage, settings in ((cluster, {}), (cluster_lights, {"resolution": 16})):
+        config = {cluster: ClusterConfig, cluster_lights: LightConfig}[stage]
+        with pytest.raises(StoreError, match="objects that may be moved"):
+            stage(config(store=store.path, output=output, quiet=True, **settings))

@@ -44,12 +44,12 @@ def open_rows(
     def put(e: int) -> None:
         own, part = entities[e].own, lookup.part(e)
         which = lookup.sample[part]
-        turn = (entities[e].turn(order) * window(order, windowed)).T.astype(np.float32)
+        turn = (entities[e].turn(order) * window(order, windowed)).T.astype(np.float32, order="C")
         if own.occlusion is not None:
-            rows[part, 0] = own.occlusion[which] @ turn
+            rows[part, 0] = _times(own.occlusion[which], turn)
         if own.radiance is not None:
-            sent = own.radiance[which].transpose(0, 2, 1)
-            rows[part, 1:] = (sent.reshape(-1, n) @ turn).reshape(sent.shape)
+            sent = np.ascontiguousarray(own.radiance[which].transpose(0, 2, 1))
+            rows[part, 1:] = _times(sent.reshape(-1, n), turn).reshape(sent.shape)
 
     in_parts(lambda a, b: _each(put, a, b), len(entities), threads)
     return rows
@@ -73,10 +73,21 @@ def put_reflections(
             return
         turn = entities[e].turn(order)
         seen = transfer.reflect(lights[e] @ turn.astype(np.float32), lookup.sample[part])
-        back = (turn * window(order, windowed)).T.astype(np.float32)
-        rows[part, 1:] = (seen.reshape(-1, order * order) @ back).reshape(seen.shape)
+        back = (turn * window(order, windowed)).T.astype(np.float32, order="C")
+        rows[part, 1:] = _times(seen.reshape(-1, order * order), back).reshape(seen.shape)
 
     in_parts(lambda a, b: _each(put, a, b), len(entities), threads)
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _times(values, matrix):  # type: ignore[no-untyped-def]
+    """values (k, N) times matrix (N, N): a library's threads would stand in the way of ours."""
+    out = np.zeros(values.shape, np.float32)
+    for r in range(values.shape[0]):
+        for i in range(values.shape[1]):
+            for j in range(values.shape[1]):
+                out[r, j] += values[r, i] * matrix[i, j]
+    return out
 
 
 def _each(work: Callable[[int], None], start: int, stop: int) -> None:

@@ -9,6 +9,7 @@ both hold the entity, and for boxes, walls and balls one of them is the surface.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -106,7 +107,12 @@ class Entity:
 
     def turn(self, order: int) -> NDArray[np.float64]:
         """(N, N): coefficients in the entity's frame to those in the world's."""
-        return rotation_matrices(self.rotation, order)
+        return _turn(np.ascontiguousarray(self.rotation, np.float64).tobytes(), order)
+
+
+@lru_cache(maxsize=256)
+def _turn(rotation: bytes, order: int) -> NDArray[np.float64]:
+    return rotation_matrices(np.frombuffer(rotation).reshape(3, 3), order)
 
 
 class Lookup(NamedTuple):

@@ -112,15 +112,18 @@ def never_negative(radiance: NDArray[np.float32]) -> tuple[NDArray[np.float32], 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
 def _diffuse(by, light, turn, out):  # type: ignore[no-untyped-def]
     n = light.shape[2]
-    world = np.empty(n, np.float32)
+    own = np.empty(n, np.float32)
     for p in range(len(light)):
         for c in range(3):
+            start, width = 0, 1
+            while start < n:  # band by band: a rotation mixes no others
+                for j in range(start, start + width):
+                    own[j] = np.float32(0.0)
+                for i in range(start, start + width):
+                    for j in range(start, start + width):
+                        own[j] += turn[i, j] * light[p, c, i]
+                start, width = start + width, width + 2
             total = np.float32(0.0)
-            for i in range(n):
-                world[i] = np.float32(0.0)
-            for i in range(n):
-                for j in range(n):
-                    world[i] += turn[i, j] * by[p, j, c]
-            for i in range(n):
-                total += world[i] * light[p, c, i]
+            for j in range(n):
+                total += by[p, j, c] * own[j]
             out[p, c] = total
