@@ -3,7 +3,8 @@
 the map             small bright places become points, for which rays are traced; the rest is shared out over leaves
 a new map           moments of the leaves that changed, and what they change in the irradiance [Johan and Nishita,
                     Eq. 15, with C_t for the printed C_i]
-specular lobes      as baked in for one view; their colour may change
+specular lobes      as baked in for one view; their colour may change. Without a fixed view: integrated from the
+                    visibility bits of the transfer store, for every view and every lobe
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 import relight_formats as formats
 from relightcli.adapters.rays import Tracer
 from relightcli.core.brdf.models import SPECULAR, MaterialTable, widen
+from relightcli.core.lights.environment import latlong_to_cube
 from relightcli.core.lights.leaf_light import LeafLight, Splitter
 from relightcli.core.lights.points import Points, split_points
 from relightcli.core.lights.quadtree import Tree, build_tree, leaves_at
@@ -87,7 +89,8 @@ class ClusteredStore(LightingStore):
     ) -> Radiance:
         sky = self.sky
         shines = bool(coats.shiny.any()) and view is not None
-        if shines and self._lobes is None:
+        baked = "light_clusters/lobe" in self.store or "visibility/bits" not in self.store
+        if shines and baked and self._lobes is None:
             self._lobes = _BakedLobes(self)
         sky.set_light(environment, rotate)
         total = sky.irradiance
@@ -100,11 +103,15 @@ class ClusteredStore(LightingStore):
         diffuse = coats.diffuse(e)
         if not shines or view is None:
             return Radiance(diffuse, None)
-        assert self._lobes is not None
-        specular = self._lobes.shine(sky, coats, view)
+        colour = coats.table.parameters[coats.material][:, SPECULAR : SPECULAR + 3].astype(np.float32)
+        if self._lobes is None:
+            rows = np.flatnonzero(coats.shiny if looked_at is None else coats.shiny & looked_at)
+            cells = latlong_to_cube(environment, self.resolution, rotate)
+            specular = self._exact_specular(cells, environment, rotate, coats, view, rows)
+        else:
+            specular = self._lobes.shine(sky, coats, view) * colour
         if lamps is not None:
-            specular += lamps
-        specular *= coats.table.parameters[coats.material][:, SPECULAR : SPECULAR + 3].astype(np.float32)
+            specular += lamps * colour
         return Radiance(diffuse, specular)
 
 

@@ -101,7 +101,10 @@ def cluster_lights(config: Config) -> dict[str, Any]:
     with writer:
         resumed = bool(writer.done)
         writer.set_attrs(lighting.store.attrs)
-        left_out = ("visibility/", "direct/", "bounce/")
+        # Lobes that are not baked in are integrated from the bits: every view, and every lobe.
+        left_out = (
+            ("direct/", "bounce/") if view is None and _may_shine(lighting) else ("visibility/", "direct/", "bounce/")
+        )
         copy_arrays(lighting.store, writer, [n for n in lighting.store.names() if not n.startswith(left_out)])
         _put_receivers(writer, lighting, view)
         words = -(-len(lighting) // 64)
@@ -160,7 +163,7 @@ def _check(config: Config) -> float:
 
 
 def _fixed_view(lighting: LightingStore, camera: str | None) -> tuple[str, NDArray[np.float32]] | None:
-    """Name of the camera and directions to it, (N, 3), where lobes are baked; None where there are none."""
+    """Name of the camera and directions to it, (N, 3), where lobes are baked in; None where they are not."""
     shiny = any(m.model in SHINY and any(m.specular) for m in lighting.scene.materials.values())
     if lighting.camera_name is not None:
         if camera not in (None, lighting.camera_name):
@@ -171,16 +174,17 @@ def _fixed_view(lighting: LightingStore, camera: str | None) -> tuple[str, NDArr
         view[: lighting.pixels] = lighting.store.read("receivers/view")
         return lighting.camera_name, view
     if camera is None:
-        if shiny:
-            raise InputError(
-                "a material has a specular lobe, which looks different from everywhere: fix the view with --camera"
-            )
         return None
     eye = np.array(resolve_camera(camera, lighting.scene.cameras).eye)
     if not shiny:
         return None
     d = eye - lighting.position
     return camera, (d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-300)).astype(np.float32)
+
+
+def _may_shine(lighting: LightingStore) -> bool:
+    """Whether any material has a specular lobe, or may be given one."""
+    return any(m.model in SHINY and (m.adjustable or any(m.specular)) for m in lighting.scene.materials.values())
 
 
 def _put_receivers(

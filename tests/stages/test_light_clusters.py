@@ -22,7 +22,7 @@ from relightcli.stages.relight import Config as RelightConfig
 from relightcli.stages.relight import relight
 from tests.core.shade.skies import smooth_map
 from tests.core.transport.scenes import Part, lambert, sphere
-from tests.stages.scene_files import make_store, picture, write_scene
+from tests.stages.scene_files import make_store, picture, read_layers, write_scene
 from tests.stages.test_precompute import array_bytes
 
 CAMERA = Camera("main", (0.4, 1.6, 2.4), (0, 0.3, 0), fov=40, size=(48, 36))
@@ -398,8 +398,21 @@ def test_specular_lobes_of_a_fixed_view(glossy):
         picture(store, "c.exr", camera="other")
     with pytest.raises(InputError, match="ball: another specular lobe than the clusters were made for"):
         picture(store, "c.exr", settings=("ball.roughness=0.5",))
-    with pytest.raises(InputError, match="fix the view with --camera"):
-        clusters(glossy, "none.zarr")
+
+
+def test_without_a_fixed_view_every_view_and_lobe_will_do(glossy):
+    store = clusters(glossy, "any.zarr")
+    with_lobes, matte = formats.open_store(store), formats.open_store(clusters(glossy, "fixed.zarr", camera="main"))
+    assert "visibility/bits" in with_lobes
+    assert "visibility/bits" not in matte
+    for k, camera in enumerate(("main", "other")):
+        for settings in ((), ("ball.roughness=0.5", "ball.specular=0.2,0.5,0.9")):
+            given = {"env": "smooth", "camera": camera, "settings": settings, "layers": True}
+            picture(store, f"a{k}.exr", **given)
+            picture(glossy, f"b{k}.exr", **given)
+            ours, exact = (read_layers(store.parent / f"{name}{k}.exr") for name in "ab")
+            np.testing.assert_allclose(ours["specular"], exact["specular"], rtol=1e-5, atol=1e-6)
+            assert relative_rmse(ours["direct"], exact["direct"]) < 0.03
 
 
 @pytest.mark.slow
