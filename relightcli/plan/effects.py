@@ -8,6 +8,7 @@ made.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -139,7 +140,8 @@ def bounces_needed(tails: Sequence[Share], allowed: float) -> int:
         if tail.bound <= allowed:
             return k
     bound, number = tails[-1].bound, len(tails) - 1
-    ratio = min(bound / tails[-2].bound, 0.95)
+    before = tails[-2].bound
+    ratio = min(bound / before, 0.95) if 0.0 < before < math.inf else 0.95
     while bound > allowed and number < MOST_PLANNED:
         bound, number = bound * ratio, number + 1
     return number

@@ -243,7 +243,6 @@ def precompute(config: Config) -> dict[str, Any]:
             {
                 "scene": scene_to_json(scene, geometry),
                 "plan": [_row(d) for d in plan],
-                "planning_seconds": planning,
                 "tried": [{"light_resolution": r, "share": e.share, "where": e.where} for r, e in tried],
                 "nothing_blocks": asked is None and not shadows,
             }
@@ -298,7 +297,8 @@ def precompute(config: Config) -> dict[str, Any]:
             )
         if promise is not None:
             keep_promise(config, promise, resolution, scene, source, geometry, receivers, buried, writer)
-        writer.commit({"seconds": time.perf_counter() - started, "resumed": resumed, "workers": config.workers})
+        seconds = time.perf_counter() - started
+        writer.commit({"seconds": seconds, "planning_seconds": planning, "resumed": resumed, "workers": config.workers})
     return _summary(config, started, resumed, geometry)
 
 

@@ -221,6 +221,8 @@ BOWL = BALL_FACES[:, ::-1]
         ((0.4, 0.2), 0.05, 3),  # halves from bounce to bounce
         ((0.4, 0.4), 0.01, MOST_PLANNED),
         ((np.inf, 0.001), 0.01, 1),
+        ((0.3, 0.0, 0.1), 0.01, 1),
+        ((np.inf, np.inf), 0.01, MOST_PLANNED),
         ((0.0, 0.0), 0.01, 0),
     ],
 )

@@ -253,7 +253,9 @@ def test_light_of_one_pixel_casts_its_shadow_to_the_texel(tmp_path):
         solid = (2 * math.pi / 1024) * (
             math.sin(math.pi * (0.5 - row / 512)) - math.sin(math.pi * (0.5 - (row + 1) / 512))
         )
-        np.testing.assert_allclose(direct.diffuse[ground][lit], 1e6 * solid * d[1] / math.pi, rtol=1e-3)
+        # Within half a pixel of the map, and its corners, parts of the light are seen.
+        whole = lit & (np.abs(inside) > 1.5 * (math.pi / 1024) / d[1] ** 2)
+        np.testing.assert_allclose(direct.diffuse[ground][whole], 1e6 * solid * d[1] / math.pi, rtol=1e-3)
 
 
 def test_thousand_edits_end_where_a_full_relight_does(clustered):

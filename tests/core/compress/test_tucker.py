@@ -256,7 +256,8 @@ def test_sequential_takes_no_more_rank_than_there_is():
     rng = np.random.default_rng(4)
     x = np.einsum("ai,bi,ci->abc", *(rng.standard_normal((n, 3)) for n in (40, 6, 9))).astype(np.float32)
     found = sequential_hosvd(x, (200, None, 200))
-    assert found.error2 <= 1e-10 * found.norm2
+    # A difference of squares of float32 products: known to a few roundings of 1.2e-7, whose sign is the processor's.
+    assert found.error2 <= 5e-7 * found.norm2
     zero = sequential_hosvd(np.zeros((5, 4, 3), np.float32), (2, None, 2))
     assert zero.error2 == 0.0
     with pytest.raises(ValueError, match="three ranks"):
