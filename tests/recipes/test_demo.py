@@ -71,7 +71,7 @@ def test_the_page_holds_everything_in_itself(demo):
     assert len(sources) == 10
     assert sum(s.startswith("data:image/p") for s in sources) == 9
     assert sum(s.startswith("data:image/w") for s in sources) == 1
-    assert "http" not in page
+    assert "http" not in re.sub(r'"data:[^"]*"', "", page)  # letters of a picture may spell anything
     for part in ("relightcli precompute scene/scene.toml", "--frames turntable.toml", "--reference --spp 4", "relrmse"):
         assert part in page
 
