@@ -131,7 +131,7 @@ def light_at(
         look = lookup.place[a:b], lookup.weight[a:b], lookup.nearest[a:b]
         _chain(*look, flat, own, terms, *factors, out[a:b])
 
-    in_parts(part, count, threads)
+    in_parts(part, count, threads if count > 32 * LANES else 1)  # a few points fill no lanes when they are split
     return out
 
 

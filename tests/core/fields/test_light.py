@@ -212,7 +212,10 @@ def test_chain_is_the_products_one_by_one():
             own[0, 0] += (1 - w.sum()) * EVEN
             expected[p] = own[1:] + product(own[0], expected[p])
     np.testing.assert_allclose(light_at(lookup, rows, sky), expected, atol=1e-5 * np.abs(expected).max())
-    np.testing.assert_array_equal(light_at(lookup, rows, sky, threads=3), light_at(lookup, rows, sky))
+    many = look_up(entities, np.tile(points, (80, 1)), np.full(37 * 80, NONE), threads=3)  # enough to be split
+    np.testing.assert_array_equal(
+        light_at(many, rows, sky, threads=3), np.tile(light_at(lookup, rows, sky), (80, 1, 1))
+    )
 
 
 def test_black_objects_and_far_objects_reflect_nothing():
