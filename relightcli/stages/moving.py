@@ -8,7 +8,7 @@ it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from relightcli.core.brdf.separable import POLAR
 from relightcli.core.fields.body import clamped_cosine
 from relightcli.core.fields.chain import EVEN, light_at, open_rows, passing, put_reflections
 from relightcli.core.fields.close import Close, add_samples, look_close, sent
-from relightcli.core.fields.dimmed import dim, sky_basis, sky_terms
+from relightcli.core.fields.dimmed import dim, may_block, sky_basis, sky_terms
 from relightcli.core.fields.entities import Entity, Lookup, look_up
 from relightcli.core.fields.shade import diffuse, never_negative, specular
 from relightcli.core.fields.standing import (
@@ -61,7 +61,8 @@ class _Placed:
     entities: the movers, then the local lights; rows: their samples' (`chain.open_rows`), emitted light included;
     close: per mover its close points, and their rows; targets: slices of every mover's proxies and points;
     passed (n, N): what all movers let pass to the standing receivers; views: what stands, from each mover's sites;
-    thinned: the lookup with what stands before an entity taken off its weight; gather: of the standing receivers.
+    thinned: the lookup with what stands before an entity taken off its weight; gather, light_bits: of the standing
+    receivers, once they are needed.
     """
 
     entities: list[Entity]
@@ -73,7 +74,8 @@ class _Placed:
     passed: F32
     views: list[Views]
     thinned: Lookup
-    gather: Gather | None = field(default=None)
+    gather: Gather | None = None
+    light_bits: NDArray[np.uint8] | None = None
 
 
 class MovingStore(LightingStore):
@@ -291,32 +293,42 @@ class MovingStore(LightingStore):
     def _lamps(
         self, coats: _Coats, view: NDArray[np.float32] | None, active: NDArray[np.bool_] | None
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]] | tuple[None, None]:
-        """Local lights on what stands, from bits; they lose what the movers take from the lights' low-order light."""
+        """Local lights on what stands, from bits: past what stands and, traced for every placement, what moves."""
         if not self._now.lights:
             return None, None
         n = self.static
-        lights = pack_lights(self._now.lights.values())
-        mask = np.ones(n, bool) if active is None else active[:n]
-        towards = None if view is None else view[:n]
         e, shine = np.zeros((len(self), 3), np.float32), np.zeros((len(self), 3), np.float32)
         e[:n], shine[:n] = local_radiance(
             self._light_bits(),
-            lights,
+            pack_lights(self._now.lights.values()),
             self.position[:n],
             self.normal[:n],
-            towards,
+            None if view is None else view[:n],
             coats.material[:n],
             coats.table,
-            mask,
+            np.ones(n, bool) if active is None else active[:n],
             self.threads,
         )
-        left = self._share_of_lamps()
-        e[:n] *= left
-        shine[:n] *= left
         return e, shine
 
     def _light_bits(self) -> NDArray[np.uint8]:
-        """Points of the local lights that the standing receivers see past what stands, (n, points / 8)."""
+        """Points of the local lights that the standing receivers see, (n, points / 8)."""
+        placed, n = self._where(), self.static
+        if placed.light_bits is None:
+            lights = pack_lights(self._now.lights.values())
+            bits = self._past_what_stands().copy()
+            near = np.zeros(n, bool)
+            for light in placed.entities[len(self.movers) :]:
+                for mover in placed.entities[: len(self.movers)]:
+                    near |= may_block(self.position[:n], *_ball(light), *_ball(mover))
+            rows = np.flatnonzero(near)
+            own = np.isin(self.geometry.face_object, [self.geometry.object_names.index(m.name) for m in self.movers])
+            tracer = Tracer(self.geometry.positions, self.geometry.faces[own])
+            bits[rows] &= light_bits(tracer, lights, self.position[rows], self.normal[rows])[0]
+            placed.light_bits = bits
+        return placed.light_bits
+
+    def _past_what_stands(self) -> NDArray[np.uint8]:
         if self._now.lights == self.scene.lights:
             bits: Any = self.store.read("lights/bits")
             return np.asarray(bits[: self.static])
@@ -327,22 +339,6 @@ class MovingStore(LightingStore):
             found, _ = light_bits(tracer, pack_lights(key), self.position[rows], self.normal[rows])
             self._bits_of_lights = {key: found}
         return self._bits_of_lights[key]
-
-    def _share_of_lamps(self) -> F32:
-        """Of the irradiance that all lights together send to the standing receivers, what the movers leave, (n, 3)."""
-        placed = self._where()
-        lookup = _part(placed.lookup, slice(0, self.static))
-        none = np.zeros((3, self.order**2))
-        clear = placed.rows.copy()
-        for e in range(len(self.movers)):
-            clear[lookup.part(e), 0] = 0.0
-            clear[lookup.part(e), 0, 0] = EVEN
-            clear[placed.close[e][1], 0] = 0.0
-            clear[placed.close[e][1], 0, 0] = EVEN
-        dimmed = self._irradiance_of(light_at(lookup, placed.rows, none, self.threads))
-        whole = self._irradiance_of(light_at(lookup, clear, none, self.threads))
-        share = np.divide(dimmed, whole, out=np.ones_like(whole), where=whole > 0.0)
-        return np.clip(share, 0.0, 1.0)
 
     def _irradiance_of(self, light: F32) -> F32:
         """Irradiance (n, 3) of the standing receivers under light (n, 3, N), past nothing."""

@@ -39,6 +39,22 @@ def sky_terms(bits: NDArray[np.uint8], normals: NDArray[np.float32], basis: NDAr
     return out.astype(np.float32)
 
 
+def may_block(
+    points: NDArray[np.float64],
+    light: NDArray[np.float64],
+    light_radius: float,
+    center: NDArray[np.float64],
+    radius: float,
+) -> NDArray[np.bool_]:
+    """Where (n,) a ball may come between points (n, 3) and a light within another ball: where it meets the capsule
+    about the way to the light's centre."""
+    way = light - points
+    along = ((center - points) * way).sum(axis=1) / np.maximum((way * way).sum(axis=1), 1e-300)
+    nearest = points + np.clip(along, 0.0, 1.0)[:, None] * way
+    out: NDArray[np.bool_] = ((nearest - center) ** 2).sum(axis=1) <= (radius + light_radius) ** 2
+    return out
+
+
 def dim(
     gather: Gather,
     positions: NDArray[np.float64],
