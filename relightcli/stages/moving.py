@@ -21,7 +21,7 @@ from relightcli.core.brdf.models import SPECULAR
 from relightcli.core.brdf.separable import POLAR
 from relightcli.core.fields.body import clamped_cosine
 from relightcli.core.fields.chain import EVEN, light_at, open_rows, passing, put_reflections
-from relightcli.core.fields.close import Close, add_samples, look_close, sent
+from relightcli.core.fields.close import Close, add_samples, covered, look_close, sent
 from relightcli.core.fields.dimmed import dim, may_block, sky_basis, sky_terms
 from relightcli.core.fields.entities import Entity, Lookup, look_up
 from relightcli.core.fields.shade import diffuse, never_negative, specular
@@ -60,9 +60,9 @@ class _Placed:
     Targets, where light is looked up: the standing receivers, then of every mover its proxies and its points.
     entities: the movers, then the local lights; rows: their samples' (`chain.open_rows`), emitted light included;
     close: per mover its close points, and their rows; targets: slices of every mover's proxies and points;
-    passed (n, N): what all movers let pass to the standing receivers; views: what stands, from each mover's sites;
-    thinned: the lookup with what stands before an entity taken off its weight; gather, light_bits: of the standing
-    receivers, once they are needed.
+    passed (n, N): what all movers let pass to the standing receivers; covered (receivers,): what nothing can see;
+    views: what stands, from each mover's sites; thinned: the lookup with what stands before an entity taken off its
+    weight; gather, light_bits: of the standing receivers, once they are needed.
     """
 
     entities: list[Entity]
@@ -72,6 +72,7 @@ class _Placed:
     close: list[tuple[Close, slice]]
     targets: list[tuple[slice, slice]]
     passed: F32
+    covered: NDArray[np.bool_]
     views: list[Views]
     thinned: Lookup
     gather: Gather | None = None
@@ -142,6 +143,10 @@ class MovingStore(LightingStore):
                 )
         return super().exit_radiance(environment, rotate, materials, view, active, basis, bounces)
 
+    def buried(self) -> NDArray[np.bool_]:
+        """See `LightingStore.buried`. What a mover stands on cannot be seen either."""
+        return self._where().covered
+
     # -- where things are
 
     def _where(self) -> _Placed:
@@ -165,10 +170,14 @@ class MovingStore(LightingStore):
         lookup = look_up(entities, places, without, self.threads)
         rows = open_rows(entities, lookup, self.order, threads=self.threads)
         close = []
+        hidden = super().buried().copy()
         for e, mover in enumerate(self.movers):
             found = look_close(entities[e], e, mover.body, mover.tracer, places, lookup)
             lookup, rows, where = add_samples(lookup, rows, found, e, entities[e].turn(self.order))
             close.append((found, where))
+            under = found.target[found.target < self.static]
+            part = covered(found, self.normal[under], entities[e].rotation)
+            hidden[under[part]] = True
         views = [self._views_of(mover, entities[e]) for e, mover in enumerate(self.movers)]
         weight = lookup.weight.copy()
         for (proxies, on), mover, entity, seen in zip(targets, self.movers, entities, views, strict=False):
@@ -180,7 +189,9 @@ class MovingStore(LightingStore):
                 weight[proxies, other] *= share[: mover.proxies, None]
                 weight[on, other] *= mover.spread.blend(share[mover.proxies :, None])
         passed = passing(_part(lookup, slice(0, self.static)), _dark(rows), self.threads)
-        return _Placed(entities, places, lookup, rows, close, targets, passed, views, lookup._replace(weight=weight))
+        return _Placed(
+            entities, places, lookup, rows, close, targets, passed, hidden, views, lookup._replace(weight=weight)
+        )
 
     def _views_of(self, mover: Mover, entity: Entity) -> Views:
         """What stands, from the sites of an object; the last place of each is kept."""
@@ -403,7 +414,7 @@ class MovingStore(LightingStore):
             self._mirror(coats, view, arriving, specular)
         standing = light.copy()
         standing[n:] = 0.0
-        behind = [light_from_surfaces(views, standing, self.order) for views in placed.views]
+        behind = [light_from_surfaces(views, standing, self.order, placed.covered) for views in placed.views]
         self._light_movers(placed, rows, behind, view, out, specular)
         return out
 

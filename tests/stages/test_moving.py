@@ -110,7 +110,6 @@ def errors(store, moves, **settings):
 )
 def test_things_that_are_moved_look_as_in_the_reference(store, moves):
     found = errors(store, moves)
-    print(moves, found)
     assert found[""] <= WHOLE
     assert found["direct"] <= WHOLE
     assert found["one_bounce"] <= TWICE
@@ -125,18 +124,19 @@ def test_a_moved_lamp_lights_what_stands_and_what_moves(tmp_path, library):
     path = make_store(write(tmp_path, more=lamp), **SMALL, bounces=1, field_library=library)
     for moves in ((), ("lamp=-1,3,1", "ball=0,0.7,0"), ("panel=1,2,1,0,0,-30", AWAY)):
         found = errors(path, moves, env="even")
-        print(moves, found)
         assert found[""] <= WHOLE
         assert found["one_bounce"] <= TWICE
 
 
-def test_white_things_under_an_even_sky_cannot_be_seen(tmp_path, library):
+def test_white_things_under_an_even_sky_shine_as_it_does(tmp_path, library):
+    """Cut to four bands, the horizon of a floor costs a point that faces the sky 1.4 %; what is left after eight
+    reflections is below 0.3 %."""
     path = make_store(write(tmp_path, albedo=(1.0, 1.0, 1.0)), **SMALL, bounces=8, field_library=library)
-    for moves in (("ball=0,0.9,0", "block=1.2,0.8,0"), ("ball=0,0.9,0", "block=0.7,1,0.3,10,20,30")):
-        rgb, alpha = picture(path, env="even", moves=moves)
-        seen = rgb[alpha == 1.0]
-        print(moves, seen.min(), seen.max(), seen.mean())
-        assert abs(seen - 1.0).max() < 0.02
+    for k, moves in enumerate((("ball=-1.5,0.9,0", "block=1,1,0.3,10,20,30"), ("ball=1000,0,0", AWAY))):
+        output = tmp_path / f"white{k}.zarr"
+        relight(Config(store=path, output=str(output), env="even", moves=moves, workers=1, quiet=True))
+        radiance = formats.open_store(output).read("radiance")[0]
+        assert np.abs(radiance - 1.0).max() < (0.02, 0.001)[k]
 
 
 def test_what_is_far_away_leaves_no_trace(store, tmp_path):
@@ -156,7 +156,6 @@ def test_frames_move_things(store, tmp_path):
     result = relight(
         Config(store=store, output=str(tmp_path / "f##.exr"), env="smooth", frames=keys, workers=1, quiet=True)
     )
-    print("seconds a frame", result["frame_seconds"], "lighting", result["lighting_seconds"])
     assert result["frames"] == 3
     for number, height in ((1, 0.5), (2, 1.0), (3, 1.5)):
         alone, _ = picture(store, env="smooth", moves=(f"ball=0,{height},0",))

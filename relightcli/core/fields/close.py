@@ -5,6 +5,7 @@ Each such point becomes a sample of its own behind those of the field: what pass
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from relightcli.core.sphere import sh
 from relightcli.core.transport.tracer import Tracer
 
 RAYS = 512
+COVERED = 0.97  # of the irradiance of even light that an object takes from a point that counts as covered by it
 
 
 class Close(NamedTuple):
@@ -39,6 +41,17 @@ def look_close(
     directions, weight = cone_rays(own[target], body.center, body.radius, RAYS, 0, 0)
     found = trace(tracer, body, tracer.to_local(own[target]), directions, weight)
     return Close(target, found, sh.harmonics(found.direction.astype(np.float64), body.order).astype(np.float32))
+
+
+def covered(close: Close, normals: NDArray[np.float32], turn: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which of the first k close points, with these normals (k, 3) in the world, the object lies on; turn (3, 3)."""
+    own = normals.astype(np.float64) @ turn
+    count = np.diff(close.found.start)[: len(own)]
+    target = np.repeat(np.arange(len(own)), count)
+    hits = slice(0, len(target))
+    cosine = np.maximum((close.found.direction[hits] * own[target]).sum(axis=1), 0.0) * close.found.weight[target]
+    out: NDArray[np.bool_] = np.bincount(target, cosine, len(own)) >= COVERED * math.pi
+    return out
 
 
 def add_samples(

@@ -104,28 +104,37 @@ def _add_open(distance, cells, out):  # type: ignore[no-untyped-def]
                 out[s] += cells[k]
 
 
-def light_from_surfaces(views: Views, exits: NDArray[np.float32], order: int) -> NDArray[np.float32]:
-    """Light (S, 3, N) float32 that the surfaces send whose exit radiance is exits (receivers, 3)."""
+def light_from_surfaces(
+    views: Views, exits: NDArray[np.float32], order: int, covered: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """Light (S, 3, N) float32 that the surfaces send whose exit radiance is exits (receivers, 3). Where some corners of
+    a face are covered (receivers,), the others speak for it."""
     directions = cube.texel_directions(CELLS).reshape(-1, 3)
     weight = np.tile(cube.solid_angles(CELLS).reshape(-1), 6)
     y = sh.harmonics(directions, order) * weight[:, None]
     out = np.zeros((len(views.distance), 3, order * order))
-    _add_hits(views.receiver, views.share, exits, y, out)
+    _add_hits(views.receiver, views.share, exits, y, covered, out)
     return out.astype(np.float32)
 
 
 @njit(cache=True)
-def _add_hits(receiver, share, exits, y, out):  # type: ignore[no-untyped-def]
+def _add_hits(receiver, share, exits, y, covered, out):  # type: ignore[no-untyped-def]
     for s in range(len(receiver)):
         for k in range(receiver.shape[1]):
+            clear = 0.0
+            for j in range(3):
+                if receiver[s, k, j] >= 0 and not covered[receiver[s, k, j]]:
+                    clear += share[s, k, j]
+            if clear <= 0.0:
+                continue
             for c in range(3):
                 total = 0.0
                 for j in range(3):
-                    if receiver[s, k, j] >= 0:
+                    if receiver[s, k, j] >= 0 and not covered[receiver[s, k, j]]:
                         total += share[s, k, j] * exits[receiver[s, k, j], c]
-                if total != 0.0:
-                    for i in range(y.shape[1]):
-                        out[s, c, i] += total * y[k, i]
+                total /= clear
+                for i in range(y.shape[1]):
+                    out[s, c, i] += total * y[k, i]
 
 
 def unhidden(
