@@ -162,6 +162,15 @@ class LightingStore:
             )
         return []
 
+    def set_moves(self, moves: tuple[str, ...]) -> list[str]:
+        """Puts rigid objects and local lights elsewhere; notes about it. Raises InputError where a store cannot."""
+        if moves:
+            raise InputError(
+                f"--move: {self.store.path} lights its objects where they stood when it was made; add --reference, or "
+                'precompute objects with motion = "rigid" and their fields'
+            )
+        return []
+
     def put_light(self, writer: formats.Writer) -> None:
         """Writes what a later `resume` needs, if anything."""
 
@@ -372,7 +381,7 @@ class LightingStore:
         for number in range(1, bounces + 1):
             light = Exit(diffuse if tint is None else diffuse * tint, lobe, row)
             e, specular, lobe = send(gather, first, light, number < bounces)
-            diffuse = coats.diffuse(e)
+            diffuse = self._reflected(coats, view, light.diffuse, e, specular)
             if first:
                 lights.append(light)
                 arrived.append((e, specular))
@@ -385,6 +394,18 @@ class LightingStore:
                 e[rows], specular[rows] = more[0][rows], more[1][rows]
         for e, specular in arrived:
             yield Radiance(coats.diffuse(e), specular if coats.shiny.any() else None)
+
+    def _reflected(
+        self,
+        coats: _Coats,
+        view: NDArray[np.float32] | None,
+        light: NDArray[np.float32],
+        e: NDArray[np.float32],
+        specular: NDArray[np.float32],
+    ) -> NDArray[np.float32]:
+        """Diffuse exit radiance (N, 3) after one interreflection of `light` (N, 3), which gives irradiance e and
+        specular exit radiance, (N, 3) each. A store may add to the latter what else arrives."""
+        return coats.diffuse(e)
 
     def gather(self, first: int = 0) -> Gather | None:
         """Who sees whom, of the receivers from `first` on; None where nothing blocks anything.

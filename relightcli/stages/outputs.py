@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -110,6 +111,18 @@ def check_poses(config: Config, shots: list[Shot], scene: Scene, geometry: Geome
                 raise
             raise InputError(f"{config.frames}: frame {shot.number}: {error}") from None
     return list(notes)
+
+
+def check_moves(config: Config, shots: list[Shot], put: Callable[[tuple[str, ...]], object]) -> None:
+    """Put things where every frame has them, and back again. Raises InputError as `check_shots`."""
+    for shot in shots:
+        try:
+            put(shot.moves)
+        except InputError as error:
+            if config.frames is None:
+                raise
+            raise InputError(f"{config.frames}: frame {shot.number}: {error}") from None
+    put(())
 
 
 def layer_names(count: int) -> list[str]:

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import relight_formats as formats
-from relightcli.errors import InputError
 from relightcli.stages.lighting import LightingStore
 from relightcli.stages.outputs import (
     Config,
     check,
+    check_moves,
     check_poses,
     check_shots,
     numbered,
@@ -44,8 +44,6 @@ def relight(config: Config) -> dict[str, Any]:
         from relightcli.stages.reference import render_reference
 
         return render_reference(config, shots, suffix, started)
-    if any(shot.moves for shot in shots):
-        raise InputError("--move: expected --reference beside it; this version lights moved objects by path tracing")
     lighting = open_lighting(config.store, config.workers)
     check_shots(config, shots, lighting.scene)
     for shot in shots:
@@ -54,6 +52,7 @@ def relight(config: Config) -> dict[str, Any]:
             lighting.set_poses(shot.poses)
             lighting.set_poses(())
             break
+    check_moves(config, shots, lighting.set_moves)
     if config.previous is not None:
         lighting.resume(config.previous)
     if config.dry_run:
@@ -84,7 +83,9 @@ def open_lighting(path: Path, threads: int) -> LightingStore:
     """The store of any stage that pictures are made from."""
     store = formats.open_store(path)
     if "fields" in store.attrs:
-        raise InputError(f"{path}: holds fields of what moves; this version makes pictures of it with --reference only")
+        from relightcli.stages.moving import MovingStore
+
+        return MovingStore(store, threads)
     if store.kind == "asset":
         from relightcli.stages.asset import AssetStore
 

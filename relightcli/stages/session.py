@@ -35,6 +35,8 @@ from relightcli.stages.outputs import (
 )
 from relightcli.stages.shots import Shot
 
+CHANGES = ("light", "materials", "places")
+
 
 @dataclass(frozen=True)
 class _View:
@@ -62,11 +64,13 @@ class Session:
         self._radiance: list[NDArray[np.float32]] = []
         self._last: tuple[object, ...] = ()
         self._poses: tuple[str, ...] | None = None
+        self._moves: tuple[str, ...] | None = None
         self._positions: list[NDArray[np.float64]] = []
         self._seconds: dict[str, list[float]] = {}
 
     def write(self, shot: Shot, suffix: str) -> str:
         self._pose(shot.poses)
+        self._move(shot.moves)
         materials = apply_settings(self.lighting.scene.materials, shot.settings)
         if suffix in PICTURES:
             with ThreadPoolExecutor(1) as reader:  # the map is read while the view is made
@@ -96,6 +100,15 @@ class Session:
         self._views.clear()
         self._tracer = None
 
+    def _move(self, moves: tuple[str, ...]) -> None:
+        """Puts things elsewhere; what was seen of others is not kept."""
+        if moves == self._moves or (self._moves is None and not moves):
+            return
+        self._moves = moves
+        self.notes.extend(n for n in self.lighting.set_moves(moves) if n not in self.notes)
+        self._views.clear()
+        self._tracer = None
+
     def _environment(self, shot: Shot) -> NDArray[np.float32]:
         path = resolve_environment(shot.env, self.lighting.scene.environments)
         if self._map is None or self._map[0] != path:
@@ -120,15 +133,16 @@ class Session:
         )
         seconds = time.perf_counter() - clock
         self.lighting_seconds += seconds
-        now = (id(environment), shot.env_rotate), shot.settings
+        now = (id(environment), shot.env_rotate), shot.settings, shot.moves
         if self._last:
-            kind = "light" if now[0] != self._last[0] else "materials" if now[1] != self._last[1] else "view"
+            changed = [kind for kind, a, b in zip(CHANGES, now, self._last, strict=True) if a != b]
+            kind = changed[0] if changed else "view"
             self._seconds.setdefault(kind, []).append(seconds)
         self._last = now
         return radiance
 
     def rates(self) -> dict[str, float]:
-        """Frames of light per second, median, by what has changed: light, else materials, else view."""
+        """Frames of light per second, median, by what has changed: light, else materials, else places, else view."""
         return {kind: 1.0 / max(median(seconds), 1e-9) for kind, seconds in self._seconds.items()}
 
     def _view(self, name: str | None) -> _View:
@@ -212,6 +226,8 @@ class Session:
         }
         if shot.poses:
             metadata["relight:pose"] = " ".join(shot.poses)
+        if shot.moves:
+            metadata["relight:move"] = " ".join(shot.moves)
         return put_picture(config, shot, suffix, pixels, layers, metadata)
 
     def _write_ply(self, shot: Shot, radiance: NDArray[np.float32]) -> str:
@@ -248,6 +264,7 @@ class Session:
                 "bounces": config.bounces,
                 "frames": None if config.frames is None else formats.fingerprint_file(config.frames),
                 **({"pose": list(config.poses)} if config.poses else {}),
+                **({"move": list(config.moves)} if config.moves else {}),
             },
             inputs={"store": store.fingerprint, **self._maps, **previous},
             program=f"relightcli {__version__}",
@@ -257,7 +274,7 @@ class Session:
             return
         with writer:
             writer.put("radiance", radiance, dims=("frame", "receiver", "colour"), units="W sr-1 m-2")
-            if self._poses is None:
+            if self._poses is None and self._moves is None:
                 writer.put("receivers/position", self.lighting.position, dims=("receiver", "axis"), units="m")
             else:
                 posed = np.stack(self._positions)

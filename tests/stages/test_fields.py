@@ -20,8 +20,6 @@ from relightcli.stages.field_store import read_field, read_source
 from relightcli.stages.fields import FieldSettings, find_movers
 from relightcli.stages.light_clusters import Config as LightConfig
 from relightcli.stages.light_clusters import cluster_lights
-from relightcli.stages.relight import Config as RelightConfig
-from relightcli.stages.relight import relight
 from tests.core.transport.scenes import lambert, sphere, square
 from tests.stages.scene_files import make_store, write_scene
 
@@ -210,11 +208,6 @@ def test_dry_run_counts_the_rays_of_fields(scene):
     found = precompute(config)
     assert found["predicted"]["rays"] >= 2 * 2 * 24 * 1024
     assert {d["effect"]: d["simulate"] for d in found["plan"]}["fields"]
-
-
-def test_pictures_of_fields_need_the_reference(store):
-    with pytest.raises(InputError, match="with --reference only"):
-        relight(RelightConfig(store=store.path, output=str(store.path.parent / "a.exr"), quiet=True))
 
 
 def test_clustering_takes_nothing_that_moves(store):

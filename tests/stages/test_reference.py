@@ -135,5 +135,3 @@ def test_moved_objects_are_where_another_scene_file_has_them(tmp_path):
 def test_only_what_is_there_can_be_moved(scene, tmp_path):
     with pytest.raises(InputError, match=r"objects.ball.motion is 'static'"):
         render(scene, tmp_path / "a.exr", moves=("ball=0,1,0",))
-    with pytest.raises(InputError, match="--reference"):
-        render(scene, tmp_path / "a.exr", moves=("ball=0,1,0",), reference=False)

@@ -45,17 +45,21 @@ def cosine_transfer(bits: NDArray[np.uint8], normals: NDArray[np.float32], order
     Runs of visible texels are taken from running sums, in a fixed order: the bytes of the result depend neither on how
     receivers are put into blocks nor on the threads of a linear algebra library.
     """
-    resolution = bits.shape[2]
-    words = np.ascontiguousarray(bits).reshape(len(bits), -1).view(np.uint64)
-    basis = _moment_basis(resolution, order)
-    moments = np.zeros((len(bits), basis.shape[1]))
-    slab = max(1, SLAB_BYTES // (64 * 8 * basis.shape[1]))  # words, so that their running sums stay small
-    for first in range(0, words.shape[1], slab):
-        part = basis[64 * first : 64 * (first + slab)]
-        prefix = np.zeros((len(part) + 1, basis.shape[1]))
-        np.cumsum(part, axis=0, dtype=np.float64, out=prefix[1:])
-        _add_runs(words[:, first : first + slab], prefix, moments)
+    moments = run_sums(bits, _moment_basis(bits.shape[2], order))
     return _along(moments.reshape(len(bits), 3, order * order), np.ascontiguousarray(normals, np.float32))
+
+
+def run_sums(bits: NDArray[np.uint8], values: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Sums over the visible texels of values (6 R R, K): (N, K) float64; bits (N, 6, R, R/8)."""
+    words = np.ascontiguousarray(bits).reshape(len(bits), -1).view(np.uint64)
+    sums = np.zeros((len(bits), values.shape[1]))
+    slab = max(1, SLAB_BYTES // (64 * 8 * values.shape[1]))  # words, so that their running sums stay small
+    for first in range(0, words.shape[1], slab):
+        part = values[64 * first : 64 * (first + slab)]
+        prefix = np.zeros((len(part) + 1, values.shape[1]))
+        np.cumsum(part, axis=0, dtype=np.float64, out=prefix[1:])
+        _add_runs(words[:, first : first + slab], prefix, sums)
+    return sums
 
 
 @njit(cache=True)

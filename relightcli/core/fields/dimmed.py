@@ -1,0 +1,122 @@
+"""Light that standing receivers lose to what moves in front of them.
+
+Of the sky: the irradiance past the moving things, V_M = sum_i V_i y_i of N terms, is
+
+    E = sum_i V_i W_i,   W_i = integral over the visible sky of L (n . w) y_i(w)
+
+exact but for what V_M has been cut to; W hangs on the sky alone. Of what stands: a cell of a gather keeps the part
+V_e(w) of its light for each moving thing e that lies before the receiver seen there.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from relightcli.core.fields.standing import cone_of
+from relightcli.core.lights.environment import SkyCube
+from relightcli.core.shade.gather import Gather, in_parts
+from relightcli.core.sphere import cube, sh
+
+
+def sky_basis(sky: SkyCube, order: int) -> NDArray[np.float64]:
+    """Moments times y_i at the centre of every texel, (T, 9 N) float64: colour, then axis, then i."""
+    y = sh.harmonics(cube.texel_directions(sky.resolution).reshape(-1, 3), order)
+    moments = sky.moment.reshape(len(y), 9)
+    out: NDArray[np.float64] = (moments[:, :, None] * y[:, None, :]).reshape(len(y), -1)
+    return out
+
+
+def sky_terms(bits: NDArray[np.uint8], normals: NDArray[np.float32], basis: NDArray[np.float64]) -> NDArray[np.float32]:
+    """W (n, 3, N) float32; bits (n, 6, R, R/8), normals (n, 3), basis from `sky_basis`."""
+    sums = sh.run_sums(bits, basis).reshape(len(bits), 3, 3, -1)
+    out = np.zeros((len(bits), 3, sums.shape[3]))
+    for axis in range(3):
+        out += normals[:, axis, None, None] * sums[:, :, axis]
+    return out.astype(np.float32)
+
+
+def may_block(
+    points: NDArray[np.float64],
+    light: NDArray[np.float64],
+    light_radius: float,
+    center: NDArray[np.float64],
+    radius: float,
+) -> NDArray[np.bool_]:
+    """Where (n,) a ball may come between points (n, 3) and a light within another ball: where it meets the capsule
+    about the way to the light's centre."""
+    way = light - points
+    along = ((center - points) * way).sum(axis=1) / np.maximum((way * way).sum(axis=1), 1e-300)
+    nearest = points + np.clip(along, 0.0, 1.0)[:, None] * way
+    out: NDArray[np.bool_] = ((nearest - center) ** 2).sum(axis=1) <= (radius + light_radius) ** 2
+    return out
+
+
+def dim(
+    gather: Gather,
+    positions: NDArray[np.float64],
+    hidden: NDArray[np.float32],
+    centers: NDArray[np.float64],
+    radii: NDArray[np.float64],
+    threads: int = 1,
+) -> tuple[Gather, NDArray[np.float32]]:
+    """The gather past E moving things; and the share (n, E) float32 of each that nothing standing hides.
+
+    positions (N, 3) of all receivers, the gather's n first; hidden (n, E, N) coefficients of what each thing hides of
+    even light, in the world's frame; centers (E, 3), radii (E,): bounding spheres. Before a thing lies what is nearer
+    than the middle of its bounding sphere along the cell's direction.
+    """
+    n, count = hidden.shape[:2]
+    cosine, solid = gather.cosine.copy(), gather.solid_angle.copy()
+    share = np.ones((n, count), np.float32)
+    directions = cube.texel_directions(gather.cells).reshape(-1, 3)
+    whole = np.tile(cube.solid_angles(gather.cells).reshape(-1), 6)
+    y = sh.harmonics(directions, math.isqrt(hidden.shape[2]))
+    p = np.ascontiguousarray(positions, np.float64)
+
+    def part(a: int, b: int) -> None:
+        _dim(
+            a, b, gather.start, gather.source, gather.cell, gather.solid_angle, p, directions, whole, y, hidden,
+            centers, radii, cosine, solid, share,
+        )  # fmt: skip
+
+    in_parts(part, n, threads)
+    return gather._replace(cosine=cosine, solid_angle=solid), share
+
+
+@njit(cache=True, nogil=True)
+def _dim(  # type: ignore[no-untyped-def]
+    first, last, start, source, cell, solid_angle, positions, directions, whole, y, hidden, centers, radii, cosine,
+    solid, share,
+):  # fmt: skip
+    inside = np.zeros(len(directions), np.bool_)
+    for i in range(first, last):
+        p = positions[i]
+        for e in range(len(centers)):
+            t = centers[e]
+            far = cone_of(p, t, radii[e], directions, inside)
+            covered = total = 0.0
+            if far > 0.0:
+                for k in range(len(directions)):
+                    if inside[k]:
+                        total += whole[k]
+            for z in range(start[i], start[i + 1]):
+                k = cell[z]
+                d, q = directions[k], positions[source[z]]
+                middle = d[0] * (t[0] - p[0]) + d[1] * (t[1] - p[1]) + d[2] * (t[2] - p[2])
+                distance = math.sqrt((q[0] - p[0]) ** 2 + (q[1] - p[1]) ** 2 + (q[2] - p[2]) ** 2)
+                if distance < middle:
+                    if inside[k]:
+                        covered += solid_angle[z]
+                    continue
+                lost = 0.0
+                for j in range(y.shape[1]):
+                    lost += hidden[i, e, j] * y[k, j]
+                left = np.float32(max(1.0 - lost, 0.0))
+                cosine[z] *= left
+                solid[z] *= left
+            if total > 0.0:
+                share[i, e] = max(0.0, 1.0 - covered / total)

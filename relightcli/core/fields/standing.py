@@ -1,0 +1,216 @@
+"""What stands still, as it is seen from sites on and in what moves: its shadow on them, and the light that it sends.
+
+Rays go from every site through the centres of a cube map's texels, so that a sky is shared out over them exactly: a
+cell that is open sends
+
+    Y_i = sum over the sky's texels t in it of flux_t y_i(w_t)
+
+whatever is smaller than a cell included. A blocked one sends the exit radiance of the corners of the face that was hit,
+times w y_i, w the cell's solid angle. Points between sites take the nearest of them, by inverse distance.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from relightcli.core.lights.environment import SkyCube
+from relightcli.core.sphere import cube, sh
+from relightcli.core.transport.tracer import Tracer
+
+CELLS = 8  # along a face's side
+NEAREST = 4  # sites that a point takes light from
+
+
+class Views(NamedTuple):
+    """From S sites through K = 6 CELLS^2 cells: distance (S, K) float32 in the world, inf where it is open; receiver
+    (S, K, 3) int32 at the corners of the face that was hit, -1 where its side sends nothing; share (S, K, 3) float32.
+    """
+
+    distance: NDArray[np.float32]
+    receiver: NDArray[np.int32]
+    share: NDArray[np.float32]
+
+
+def look_around(
+    tracer: Tracer,
+    positions: NDArray[np.float64],
+    faces: NDArray[np.int32],
+    front: NDArray[np.int32],
+    back: NDArray[np.int32],
+    sites: NDArray[np.float64],
+) -> Views:
+    """Traces from sites (S, 3); tracer over the mesh positions (V, 3), faces (F, 3); front, back (V,): receivers."""
+    directions = cube.texel_directions(CELLS).reshape(-1, 3).astype(np.float32)
+    count = len(directions)
+    origins = np.repeat(tracer.to_local(sites), count, axis=0)
+    hits = tracer.intersect(origins, np.tile(directions, (len(sites), 1)))
+    distance = (np.where(hits.face >= 0, hits.distance, np.inf) / tracer.scale).astype(np.float32)
+    receiver = np.full((len(origins), 3), -1, np.int32)
+    share = np.zeros((len(origins), 3), np.float32)
+    _corners(hits.face, hits.u, hits.v, directions, positions, faces, front, back, receiver, share)
+    shape = len(sites), count
+    return Views(distance.reshape(shape), receiver.reshape(*shape, 3), share.reshape(*shape, 3))
+
+
+@njit(cache=True)
+def _corners(  # type: ignore[no-untyped-def]
+    face, u, v, directions, positions, faces, front, back, receiver, share
+):
+    for r in range(len(face)):
+        if face[r] < 0:
+            continue
+        a, b, c = faces[face[r], 0], faces[face[r], 1], faces[face[r], 2]
+        p, q, s = positions[a], positions[b], positions[c]
+        e1 = (q[0] - p[0], q[1] - p[1], q[2] - p[2])
+        e2 = (s[0] - p[0], s[1] - p[1], s[2] - p[2])
+        g = (e1[1] * e2[2] - e1[2] * e2[1], e1[2] * e2[0] - e1[0] * e2[2], e1[0] * e2[1] - e1[1] * e2[0])
+        d = directions[r % len(directions)]
+        of_vertex = front if g[0] * d[0] + g[1] * d[1] + g[2] * d[2] < 0.0 else back
+        receiver[r, 0], receiver[r, 1], receiver[r, 2] = of_vertex[a], of_vertex[b], of_vertex[c]
+        share[r, 0], share[r, 1], share[r, 2] = 1.0 - u[r] - v[r], u[r], v[r]
+
+
+def sky_cells(sky: SkyCube, order: int) -> NDArray[np.float64]:
+    """Y (K, 3, N) float64 of every cell; the sky's resolution is a multiple of CELLS."""
+    directions = cube.texel_directions(sky.resolution).reshape(-1, 3)
+    cell = cube.texel_index(directions, CELLS)
+    y = sh.harmonics(directions, order)
+    out = np.empty((6 * CELLS * CELLS, 3, order * order))
+    for c in range(3):
+        for i in range(order * order):
+            out[:, c, i] = np.bincount(cell, sky.flux[:, c] * y[:, i], len(out))
+    return out
+
+
+def light_from_sky(views: Views, cells: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Light (S, 3, N) float32 of the sky past what stands, in the world's frame."""
+    k = len(cells)
+    out = np.zeros((len(views.distance), cells.size // k))
+    _add_open(views.distance, np.ascontiguousarray(cells.reshape(k, -1)), out)
+    return out.reshape(-1, *cells.shape[1:]).astype(np.float32)
+
+
+@njit(cache=True)
+def _add_open(distance, cells, out):  # type: ignore[no-untyped-def]
+    for s in range(len(distance)):
+        for k in range(distance.shape[1]):
+            if distance[s, k] == np.inf:
+                out[s] += cells[k]
+
+
+def light_from_surfaces(
+    views: Views, exits: NDArray[np.float32], order: int, covered: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """Light (S, 3, N) float32 that the surfaces send whose exit radiance is exits (receivers, 3). Where some corners of
+    a face are covered (receivers,), the others speak for it."""
+    directions = cube.texel_directions(CELLS).reshape(-1, 3)
+    weight = np.tile(cube.solid_angles(CELLS).reshape(-1), 6)
+    y = sh.harmonics(directions, order) * weight[:, None]
+    out = np.zeros((len(views.distance), 3, order * order))
+    _add_hits(views.receiver, views.share, exits, y, covered, out)
+    return out.astype(np.float32)
+
+
+@njit(cache=True)
+def _add_hits(receiver, share, exits, y, covered, out):  # type: ignore[no-untyped-def]
+    for s in range(len(receiver)):
+        for k in range(receiver.shape[1]):
+            clear = 0.0
+            for j in range(3):
+                if receiver[s, k, j] >= 0 and not covered[receiver[s, k, j]]:
+                    clear += share[s, k, j]
+            if clear <= 0.0:
+                continue
+            for c in range(3):
+                total = 0.0
+                for j in range(3):
+                    if receiver[s, k, j] >= 0 and not covered[receiver[s, k, j]]:
+                        total += share[s, k, j] * exits[receiver[s, k, j], c]
+                total /= clear
+                for i in range(y.shape[1]):
+                    out[s, c, i] += total * y[k, i]
+
+
+def unhidden(
+    views: Views, sites: NDArray[np.float64], center: NDArray[np.float64], radius: float
+) -> NDArray[np.float32]:
+    """Share (S,) of a ball that nothing standing hides from the sites: of the cells in its cone, or of the one about
+    its centre, those that nothing blocks before the ball's middle."""
+    solid = np.tile(cube.solid_angles(CELLS).reshape(-1), 6)
+    directions = cube.texel_directions(CELLS).reshape(-1, 3)
+    out = np.ones(len(sites), np.float32)
+    _unhidden(views.distance, directions, solid, np.ascontiguousarray(sites), center, radius, out)
+    return out
+
+
+@njit(cache=True)
+def cone_of(p: Any, center: Any, radius: float, directions: Any, inside: Any) -> float:
+    """Marks the cells whose centres a ball covers from p, or the one nearest to its own; returns its distance, 0 from
+    inside, where none are."""
+    x, y, z = center[0] - p[0], center[1] - p[1], center[2] - p[2]
+    distance2 = x * x + y * y + z * z
+    inside[:] = False
+    if distance2 <= radius * radius:
+        return 0.0
+    distance = math.sqrt(distance2)
+    least = math.sqrt(1.0 - radius * radius / distance2)
+    best, nearest = -2.0, 0
+    for k in range(len(directions)):
+        d = (x * directions[k, 0] + y * directions[k, 1] + z * directions[k, 2]) / distance
+        inside[k] = d >= least
+        if d > best:
+            best, nearest = d, k
+    inside[nearest] = True
+    return distance
+
+
+@njit(cache=True)
+def _unhidden(distance, directions, solid, sites, center, radius, out):  # type: ignore[no-untyped-def]
+    inside = np.zeros(len(directions), np.bool_)
+    for s in range(len(sites)):
+        p = sites[s]
+        far = cone_of(p, center, radius, directions, inside)
+        if far == 0.0:
+            continue
+        total = hidden = 0.0
+        for k in range(len(directions)):
+            if inside[k]:
+                total += solid[k]
+                d = directions[k]
+                # Distance of the middle of the ball's chord along the cell's direction.
+                middle = d[0] * (center[0] - p[0]) + d[1] * (center[1] - p[1]) + d[2] * (center[2] - p[2])
+                if distance[s, k] < middle:
+                    hidden += solid[k]
+        out[s] = 1.0 - hidden / total
+
+
+class Between(NamedTuple):
+    """How points take what sites have: site (n, NEAREST) int64, weight (n, NEAREST) float32, rows summing to 1."""
+
+    site: NDArray[np.int64]
+    weight: NDArray[np.float32]
+
+    def blend(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Values (S, ...) float32 at the points, (n, ...)."""
+        flat = values.reshape(len(values), -1)
+        out = np.zeros((len(self.site), flat.shape[1]), np.float32)
+        for k in range(self.site.shape[1]):
+            out += self.weight[:, k, None] * flat[self.site[:, k]]
+        return out.reshape(-1, *values.shape[1:])
+
+
+def between(points: NDArray[np.float64], sites: NDArray[np.float64]) -> Between:
+    """Weights of sites (S, 3) at points (n, 3), S > 0."""
+    distance, site = cKDTree(sites).query(points, k=min(NEAREST, len(sites)))
+    distance, site = distance.reshape(len(points), -1), site.reshape(len(points), -1)
+    # Relative to the nearest; 0 / 0 at a site itself, which has all of the weight.
+    first = distance[:, :1]
+    ratio = np.divide(first, distance, out=np.ones_like(distance), where=distance > 0.0) ** 2
+    weight = np.where(first > 0.0, ratio, (distance == 0.0).astype(np.float64))
+    return Between(site, (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32))

@@ -1,0 +1,159 @@
+"""What may be moved, as a store has it, and where it is put for a picture."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import relight_formats as formats
+from relightcli.adapters.rays import Tracer
+from relightcli.core.brdf.models import SPECULAR, pack_materials
+from relightcli.core.fields.body import Body, make_body
+from relightcli.core.fields.entities import Entity, PlainTransfer, Surroundings, of_light
+from relightcli.core.fields.interpolate import make_grid
+from relightcli.core.fields.shade import Receivers, make_receivers
+from relightcli.core.fields.standing import Between, between
+from relightcli.errors import InputError
+from relightcli.scene.model import Material, RectangleLight, SphereLight
+from relightcli.stages.field_store import read_source
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+SITES = 64  # points of an object that look around at what stands
+INWARDS = 0.01  # of the way to the centre that they lie within: what stands on a floor does not look from below it
+SIMILAR = 1e-6  # relative, by which a placement may differ from a rotation and a size
+
+
+class StoredTransfer:
+    """The transfer of a field's samples, read from its store chunk by chunk as samples are asked for."""
+
+    def __init__(self, array: Any) -> None:
+        self.array, self.block, self.cells = array, array.chunks[1], array.shape[1]
+        self._read: dict[tuple[int, int], PlainTransfer] = {}
+
+    def reflect(self, light: NDArray[np.floating], which: NDArray[np.integer]) -> F32:
+        """See `entities.Transfer`. which: rising."""
+        out = np.empty((len(which), 3, light.shape[2]), np.float32)
+        shell, cell = np.divmod(which, self.cells)
+        number = shell * (1 + self.cells // self.block) + cell // self.block
+        for a, b in _runs(number):
+            at = int(shell[a]), int(cell[a]) // self.block
+            if at not in self._read:
+                first = at[1] * self.block
+                rows = np.asarray(self.array[at[0], first : first + self.block], np.float32)
+                self._read[at] = PlainTransfer(rows)
+            out[a:b] = self._read[at].reflect(light, cell[a:b] - at[1] * self.block)
+        return out
+
+
+def _runs(number: NDArray[np.integer]) -> list[tuple[int, int]]:
+    cuts = np.concatenate([[0], np.flatnonzero(np.diff(number)) + 1, [len(number)]]).tolist()
+    return [(a, b) for a, b in itertools.pairwise(cuts) if b > a]
+
+
+@dataclass(frozen=True)
+class Mover:
+    """One object that may be moved. rows: its receivers; placement (4, 4): from its field's frame to where the scene
+    has it; sites (S, 3) on it in the field's frame, after its proxies; spread: how its points take light from those."""
+
+    name: str
+    rows: slice
+    placement: F64
+    material: str
+    body: Body
+    own: Surroundings
+    tracer: Tracer
+    receivers: Receivers
+    colour: F32
+    sites: F64
+    spread: Between
+
+    @property
+    def proxies(self) -> int:
+        return 0 if self.own.proxies is None else len(self.own.proxies)
+
+    def at(self, matrix: F64) -> Entity:
+        """The object placed by (4, 4), a rotation times a positive number and a translation."""
+        return Entity(self.own, *similarity(self.name, matrix))
+
+
+def similarity(name: str, matrix: F64) -> tuple[F64, F64, float]:
+    """(rotation, translation, scale) of a placement. Raises InputError for other matrices."""
+    linear = matrix[:3, :3]
+    scale = float(np.cbrt(np.linalg.det(linear)))
+    if not scale > 0.0 or np.abs(linear.T @ linear - scale**2 * np.eye(3)).max() > SIMILAR * scale**2:
+        raise InputError(
+            f"--move {name}: expected a matrix that turns, scales evenly and shifts the object from where the scene "
+            "file has it: its fields hold for no other shape. Change the scene file and precompute again, or add "
+            "--reference."
+        )
+    return linear / scale, matrix[:3, 3].copy(), scale
+
+
+def read_movers(store: formats.Store, scene_materials: dict[str, Material], objects: dict[str, Any]) -> list[Mover]:
+    """Everything that the store has fields of; objects: the scene's, by name."""
+    order = int(store.settings["fields"]["order"])
+    parts: dict[tuple[int, str, bool], tuple[Any, ...]] = {}
+    movers = []
+    for name, about in store.attrs["fields"]["objects"].items():
+        spec = objects[name]
+        key = int(about["field"]), str(spec.material), bool(spec.two_sided)
+        if key not in parts:
+            parts[key] = _read_object(store, key, scene_materials[spec.material], order)
+        rows = slice(int(about["first"]), int(about["first"]) + int(about["count"]))
+        movers.append(Mover(name, rows, np.array(about["placement"], np.float64), spec.material, *parts[key]))
+    return movers
+
+
+def _read_object(store: formats.Store, key: tuple[int, str, bool], material: Material, order: int) -> tuple[Any, ...]:
+    prefix = f"fields/{key[0]}/"
+    read: Any = store.read
+    position, face = read(f"{prefix}mesh/position"), read(f"{prefix}mesh/face")
+    body = make_body(
+        position, read(f"{prefix}mesh/normal"), face, key[2], read(f"{prefix}mesh/texture"), material, order
+    )
+    radii, valid = read(f"{prefix}radii"), read(f"{prefix}valid")
+    proxies = read(f"{prefix}proxies")
+    used = position[np.unique(face)]
+    own = Surroundings(
+        make_grid(radii, round(math.sqrt(valid.shape[1] / 6)), valid),
+        body.center,
+        np.stack([used.min(axis=0), used.max(axis=0)]),
+        body.radius,
+        read(f"{prefix}occlusion").reshape(-1, order * order),
+        StoredTransfer(store.array(f"{prefix}transfer")),
+        None,
+        proxies,
+    )
+    albedo = np.broadcast_to(np.array(material.diffuse, np.float32), body.albedo.shape)  # texture acts in the picture
+    receivers = make_receivers(body.normal, albedo, order, read(f"{prefix}self"), body.terms > 1)
+    colour = pack_materials([material]).parameters[0, SPECULAR : SPECULAR + 3].astype(np.float32)
+    chosen = np.unique(np.linspace(0, len(body.point) - 1, SITES).astype(int))
+    on_surface = body.point[chosen]
+    sites = np.concatenate([proxies, on_surface + INWARDS * (body.center - on_surface)])
+    return body, own, Tracer(body.positions, body.faces), receivers, colour, sites, between(body.point, on_surface)
+
+
+def read_lights(store: formats.Store, lights: dict[str, SphereLight | RectangleLight]) -> dict[str, Surroundings]:
+    """The local lights' fields, by name."""
+    about = store.attrs["fields"]["lights"]
+    return {name: of_light(read_source(store, f"sources/{about[name]['source']}/")) for name in lights}
+
+
+def light_entity(own: Surroundings, stored: SphereLight | RectangleLight, now: SphereLight | RectangleLight) -> Entity:
+    """A local light where it is now; its field has the axes that the scene file gave it."""
+    rotation = np.eye(3)
+    if isinstance(stored, RectangleLight) and isinstance(now, RectangleLight):
+        rotation = _edges(now) @ np.linalg.inv(_edges(stored))
+    return Entity(own, rotation, np.array(now.center, np.float64))
+
+
+def _edges(light: RectangleLight) -> F64:
+    u, v = np.array(light.edge_u), np.array(light.edge_v)
+    normal = np.cross(u, v)
+    return np.stack([u, v, normal / np.linalg.norm(normal)], axis=1)
