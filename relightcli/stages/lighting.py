@@ -26,7 +26,9 @@ from relightcli.scene.model import Geometry, Material, Scene
 from relightcli.stages.rig_store import read_rigs
 
 if TYPE_CHECKING:
+    from relightcli.core.shade.bounces import Exit
     from relightcli.core.shade.gather import Gather
+    from relightcli.core.shade.lobe_factors import LobeFactors
 
 IN_MEMORY = 1 << 30  # visibility up to this size stays in memory between frames
 ENTRIES = 1 << 23  # of pixels' gathers that are made at a time
@@ -381,7 +383,7 @@ class LightingStore:
         for number in range(1, bounces + 1):
             light = Exit(diffuse if tint is None else diffuse * tint, lobe, row)
             e, specular, lobe = send(gather, first, light, number < bounces)
-            diffuse = self._reflected(coats, view, light.diffuse, e, specular)
+            diffuse = self._reflected(coats, view, light, factors, e, specular)
             if first:
                 lights.append(light)
                 arrived.append((e, specular))
@@ -399,12 +401,13 @@ class LightingStore:
         self,
         coats: _Coats,
         view: NDArray[np.float32] | None,
-        light: NDArray[np.float32],
+        light: Exit,
+        factors: LobeFactors,
         e: NDArray[np.float32],
         specular: NDArray[np.float32],
     ) -> NDArray[np.float32]:
-        """Diffuse exit radiance (N, 3) after one interreflection of `light` (N, 3), which gives irradiance e and
-        specular exit radiance, (N, 3) each. A store may add to the latter what else arrives."""
+        """Diffuse exit radiance (N, 3) after one interreflection of `light`, which gives irradiance e and specular
+        exit radiance, (N, 3) each. A store may add to the latter what else arrives."""
         return coats.diffuse(e)
 
     def gather(self, first: int = 0) -> Gather | None:

@@ -28,6 +28,7 @@ from relightcli.core.fields.shade import diffuse, never_negative, specular
 from relightcli.core.fields.standing import (
     CELLS,
     Views,
+    light_from_lobes,
     light_from_sky,
     light_from_surfaces,
     look_around,
@@ -35,7 +36,9 @@ from relightcli.core.fields.standing import (
     unhidden,
 )
 from relightcli.core.lights.environment import SkyCube, latlong_to_cube, splat
+from relightcli.core.shade.bounces import Exit
 from relightcli.core.shade.gather import Gather
+from relightcli.core.shade.lobe_factors import LobeFactors
 from relightcli.core.shade.local import local_radiance
 from relightcli.core.shade.low_order import response, shade_low_order
 from relightcli.core.sphere import sh
@@ -395,7 +398,8 @@ class MovingStore(LightingStore):
         self,
         coats: _Coats,
         view: NDArray[np.float32] | None,
-        light: NDArray[np.float32],
+        light: Exit,
+        factors: LobeFactors,
         e: NDArray[np.float32],
         specular: NDArray[np.float32],
     ) -> NDArray[np.float32]:
@@ -405,16 +409,19 @@ class MovingStore(LightingStore):
         rows[:, 1:] = 0.0
         put_reflections(rows, placed.entities, placed.lookup, self._lights(placed), threads=self.threads)
         for (close, where), mover, entity in zip(placed.close, self.movers, placed.entities, strict=False):
-            rows[where, 1:] = sent(close, mover.body, light[mover.rows], entity.turn(self.order))
+            rows[where, 1:] = sent(close, mover.body, light.diffuse[mover.rows], entity.turn(self.order))
         none = np.zeros((3, self.order**2))
         arriving = light_at(_part(placed.thinned, slice(0, n)), rows, none, self.threads)
         e[:n] += self._irradiance_of(arriving)
         out = coats.diffuse(e)
         if view is not None:
             self._mirror(coats, view, arriving, specular)
-        standing = light.copy()
-        standing[n:] = 0.0
-        behind = [light_from_surfaces(views, standing, self.order, placed.covered) for views in placed.views]
+        behind = []
+        for views in placed.views:
+            behind.append(light_from_surfaces(views, light.diffuse, self.order, placed.covered))
+            if len(light.lobe):
+                normals, material = self.normal, coats.material
+                behind[-1] += light_from_lobes(views, light, normals, material, factors, self.order, placed.covered)
         self._light_movers(placed, rows, behind, view, out, specular)
         return out
 

@@ -19,7 +19,10 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from relightcli.core.brdf.separable import TERMS
 from relightcli.core.lights.environment import SkyCube
+from relightcli.core.shade.bounces import Exit
+from relightcli.core.shade.lobe_factors import LobeFactors, axes_of, send_lobe, waves
 from relightcli.core.sphere import cube, sh
 from relightcli.core.transport.tracer import Tracer
 
@@ -135,6 +138,51 @@ def _add_hits(receiver, share, exits, y, covered, out):  # type: ignore[no-untyp
                 total /= clear
                 for i in range(y.shape[1]):
                     out[s, c, i] += total * y[k, i]
+
+
+def light_from_lobes(
+    views: Views,
+    light: Exit,
+    normals: NDArray[np.float32],
+    material: NDArray[np.int32],
+    factors: LobeFactors,
+    order: int,
+    covered: NDArray[np.bool_],
+) -> NDArray[np.float32]:
+    """Light (S, 3, N) float32 of the surfaces' specular lobes, as `shade.bounces` sends it; of a face, that of the
+    corner next to the hit. normals, material of the receivers."""
+    directions = cube.texel_directions(CELLS).reshape(-1, 3)
+    weight = np.tile(cube.solid_angles(CELLS).reshape(-1), 6)
+    y = sh.harmonics(directions, order) * weight[:, None]
+    out = np.zeros((len(views.distance), 3, order * order))
+    _add_lobes(views.receiver, views.share, directions, light, normals, material, factors, y, covered, out)
+    return out.astype(np.float32)
+
+
+@njit(cache=True, error_model="numpy")
+def _add_lobes(  # type: ignore[no-untyped-def]
+    receiver, share, directions, light, normals, material, factors, y, covered, out
+):
+    wave = np.empty((2, TERMS), np.float32)
+    for s in range(len(receiver)):
+        for k in range(receiver.shape[1]):
+            at, most = -1, np.float32(0.0)
+            for j in range(3):
+                r = receiver[s, k, j]
+                if r >= 0 and not covered[r] and share[s, k, j] > most:
+                    at, most = r, share[s, k, j]
+            if at < 0 or light.row[at] < 0:
+                continue
+            m = material[at]
+            axes = axes_of((np.float64(normals[at, 0]), np.float64(normals[at, 1]), np.float64(normals[at, 2])))
+            back = (-directions[k, 0], -directions[k, 1], -directions[k, 2])
+            if not waves(factors.view_factor[m], axes, back, wave):
+                continue
+            found = send_lobe(wave, light.lobe[light.row[at]])
+            for c in range(3):
+                sent = max(found[c] * factors.colour[m, c], 0.0)
+                for i in range(y.shape[1]):
+                    out[s, c, i] += sent * y[k, i]
 
 
 def unhidden(
