@@ -12,7 +12,7 @@ times w y_i, w the cell's solid angle. Points between sites take the nearest of 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -188,8 +188,8 @@ def _add_lobes(  # type: ignore[no-untyped-def]
 def unhidden(
     views: Views, sites: NDArray[np.float64], center: NDArray[np.float64], radius: float
 ) -> NDArray[np.float32]:
-    """Share (S,) of a ball that nothing standing hides from the sites: of the cells in its cone, or of the one about
-    its centre, those that nothing blocks before the ball's middle."""
+    """Share (S,) of a ball that nothing standing hides from the sites: of the cells in its cone, which is taken as wide
+    as a cell at least, those that nothing blocks before the ball's middle."""
     solid = np.tile(cube.solid_angles(CELLS).reshape(-1), 6)
     directions = cube.texel_directions(CELLS).reshape(-1, 3)
     out = np.ones(len(sites), np.float32)
@@ -198,44 +198,24 @@ def unhidden(
 
 
 @njit(cache=True)
-def cone_of(p: Any, center: Any, radius: float, directions: Any, inside: Any) -> float:
-    """Marks the cells whose centres a ball covers from p, or the one nearest to its own; returns its distance, 0 from
-    inside, where none are."""
-    x, y, z = center[0] - p[0], center[1] - p[1], center[2] - p[2]
-    distance2 = x * x + y * y + z * z
-    inside[:] = False
-    if distance2 <= radius * radius:
-        return 0.0
-    distance = math.sqrt(distance2)
-    least = math.sqrt(1.0 - radius * radius / distance2)
-    best, nearest = -2.0, 0
-    for k in range(len(directions)):
-        d = (x * directions[k, 0] + y * directions[k, 1] + z * directions[k, 2]) / distance
-        inside[k] = d >= least
-        if d > best:
-            best, nearest = d, k
-    inside[nearest] = True
-    return distance
-
-
-@njit(cache=True)
 def _unhidden(distance, directions, solid, sites, center, radius, out):  # type: ignore[no-untyped-def]
-    inside = np.zeros(len(directions), np.bool_)
+    narrow = 1.0 / math.sqrt(1.0 + 2.0 / (CELLS * CELLS))  # a cone of a larger cosine may have no cell's centre in it
     for s in range(len(sites)):
-        p = sites[s]
-        far = cone_of(p, center, radius, directions, inside)
-        if far == 0.0:
+        x, y, z = center[0] - sites[s, 0], center[1] - sites[s, 1], center[2] - sites[s, 2]
+        far2 = x * x + y * y + z * z
+        if far2 <= radius * radius:
             continue
+        least = math.sqrt(far2) * min(math.sqrt(1.0 - radius * radius / far2), narrow)
         total = hidden = 0.0
         for k in range(len(directions)):
-            if inside[k]:
+            # Distance of the middle of the ball's chord along the cell's direction.
+            middle = directions[k, 0] * x + directions[k, 1] * y + directions[k, 2] * z
+            if middle >= least:
                 total += solid[k]
-                d = directions[k]
-                # Distance of the middle of the ball's chord along the cell's direction.
-                middle = d[0] * (center[0] - p[0]) + d[1] * (center[1] - p[1]) + d[2] * (center[2] - p[2])
                 if distance[s, k] < middle:
                     hidden += solid[k]
-        out[s] = 1.0 - hidden / total
+        if total > 0.0:
+            out[s] = 1.0 - hidden / total
 
 
 class Between(NamedTuple):
