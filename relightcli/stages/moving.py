@@ -374,14 +374,6 @@ class MovingStore(LightingStore):
             start = np.zeros(n + 1, np.int64)
             whole = Gather(CELLS, start, np.zeros(0, np.int32), np.zeros(0, np.int16), nothing, nothing)
         last = int(whole.start[n])
-        centers, radii = (np.array(x) for x in zip(*(_ball(e) for e in placed.entities), strict=True))
-        hidden = np.zeros((n, len(placed.entities), self.order**2), np.float32)
-        for e in range(len(self.movers)):
-            weight = placed.lookup.weight[:n, e]
-            rows = placed.rows[:, 0]
-            hidden[:, e, 0] = EVEN * weight.sum(axis=1)
-            for k in range(weight.shape[1]):
-                hidden[:, e] -= weight[:, k, None] * rows[placed.lookup.place[:n, e, k]]
         own = Gather(
             whole.cells,
             whole.start[: n + 1],
@@ -390,6 +382,17 @@ class MovingStore(LightingStore):
             whole.cosine[:last],
             whole.solid_angle[:last],
         )
+        if not last:
+            placed.gather = own
+            return own
+        centers, radii = (np.array(x) for x in zip(*(_ball(e) for e in placed.entities), strict=True))
+        hidden = np.zeros((n, len(placed.entities), self.order**2), np.float32)
+        for e in range(len(self.movers)):
+            weight = placed.lookup.weight[:n, e]
+            rows = placed.rows[:, 0]
+            hidden[:, e, 0] = EVEN * weight.sum(axis=1)
+            for k in range(weight.shape[1]):
+                hidden[:, e] -= weight[:, k, None] * rows[placed.lookup.place[:n, e, k]]
         placed.gather, share = dim(own, self.position, hidden, centers, radii, self.threads)
         placed.thinned.weight[:n] *= share[:, :, None]
         return placed.gather
