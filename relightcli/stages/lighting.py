@@ -18,7 +18,7 @@ from relightcli.core.shade.glossy import sky_tree, specular_radiance
 from relightcli.core.shade.irradiance import irradiance, moment_prefix
 from relightcli.core.shade.local import local_radiance
 from relightcli.core.sphere import haar, sh
-from relightcli.core.transport.local_lights import pack_lights
+from relightcli.core.transport.local_lights import LocalLights, pack_lights
 from relightcli.core.transport.receivers import receivers_of_vertices
 from relightcli.errors import InputError, StoreError
 from relightcli.scene.describe import scene_from_json
@@ -316,11 +316,11 @@ class LightingStore:
         self, coats: _Coats, view: NDArray[np.float32] | None, active: NDArray[np.bool_] | None
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]] | tuple[None, None]:
         """Irradiance (N, 3) of the local lights, and their specular light without its colour; None without lights."""
-        if "lights/bits" not in self.store:
+        lights = self._local_lights()
+        if lights is None:
             return None, None
         return local_radiance(
-            self.store.read("lights/bits"),
-            pack_lights(self.scene.lights.values()),
+            *lights,
             self.position,
             self.normal,
             view,
@@ -329,6 +329,13 @@ class LightingStore:
             np.ones(len(self), bool) if active is None else active,
             self.threads,
         )
+
+    def _local_lights(self) -> tuple[NDArray[np.uint8], LocalLights] | None:
+        """Bits of the local lights' points that every receiver sees, and the lights; None without lights."""
+        if "lights/bits" not in self.store:
+            return None
+        bits: Any = self.store.read("lights/bits")
+        return bits, pack_lights(self.scene.lights.values())
 
     def _bounces(
         self,
@@ -356,10 +363,11 @@ class LightingStore:
             sky = splat(latlong_to_cube(environment, gather.cells, rotate))
             for block, bits in self.blocks(first):
                 sky_lobes(bits, self.normal[block], coats.material[block], factors, sky, lobe, row[block], self.threads)
-            if "lights/bits" in self.store:
+            lights_seen = self._local_lights()
+            if lights_seen is not None:
                 local_lobes(
-                    self.store.read("lights/bits")[first:],
-                    pack_lights(self.scene.lights.values()),
+                    lights_seen[0][first:],
+                    lights_seen[1],
                     self.position[first:],
                     self.normal[first:],
                     coats.material[first:],

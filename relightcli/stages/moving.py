@@ -39,11 +39,10 @@ from relightcli.core.lights.environment import SkyCube, latlong_to_cube, splat
 from relightcli.core.shade.bounces import Exit
 from relightcli.core.shade.gather import Gather
 from relightcli.core.shade.lobe_factors import LobeFactors
-from relightcli.core.shade.local import local_radiance
 from relightcli.core.shade.low_order import response, shade_low_order
 from relightcli.core.sphere import sh
 from relightcli.core.transport.light_visibility import light_bits
-from relightcli.core.transport.local_lights import pack_lights
+from relightcli.core.transport.local_lights import LocalLights, pack_lights
 from relightcli.core.transport.transfer import local_rotations
 from relightcli.errors import InputError
 from relightcli.scene.model import Material
@@ -65,7 +64,7 @@ class _Placed:
     close: per mover its close points, and their rows; targets: slices of every mover's proxies and points;
     passed (n, N): what all movers let pass to the standing receivers; covered (receivers,): what nothing can see;
     views: what stands, from each mover's sites; thinned: the lookup with what stands before an entity taken off its
-    weight; gather, light_bits: of the standing receivers, once they are needed.
+    weight; gather of the standing receivers, light_bits of all, once they are needed.
     """
 
     entities: list[Entity]
@@ -304,33 +303,17 @@ class MovingStore(LightingStore):
         out[still] *= np.clip(passed, 0.0, 1.0)[:, None].astype(np.float32)
         return out
 
-    def _lamps(
-        self, coats: _Coats, view: NDArray[np.float32] | None, active: NDArray[np.bool_] | None
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]] | tuple[None, None]:
-        """Local lights on what stands, from bits: past what stands and, traced for every placement, what moves."""
+    def _local_lights(self) -> tuple[NDArray[np.uint8], LocalLights] | None:
+        """See `LightingStore._local_lights`: past what stands and, traced for every placement, what moves. Nothing of
+        what moves itself, which sees the lights' fields."""
         if not self._now.lights:
-            return None, None
-        n = self.static
-        e, shine = np.zeros((len(self), 3), np.float32), np.zeros((len(self), 3), np.float32)
-        e[:n], shine[:n] = local_radiance(
-            self._light_bits(),
-            pack_lights(self._now.lights.values()),
-            self.position[:n],
-            self.normal[:n],
-            None if view is None else view[:n],
-            coats.material[:n],
-            coats.table,
-            np.ones(n, bool) if active is None else active[:n],
-            self.threads,
-        )
-        return e, shine
-
-    def _light_bits(self) -> NDArray[np.uint8]:
-        """Points of the local lights that the standing receivers see, (n, points / 8)."""
+            return None
         placed, n = self._where(), self.static
+        lights = pack_lights(self._now.lights.values())
         if placed.light_bits is None:
-            lights = pack_lights(self._now.lights.values())
-            bits = self._past_what_stands().copy()
+            still = self._past_what_stands()
+            bits = np.zeros((len(self), still.shape[1]), np.uint8)
+            bits[:n] = still
             near = np.zeros(n, bool)
             for light in placed.entities[len(self.movers) :]:
                 for mover in placed.entities[: len(self.movers)]:
@@ -340,7 +323,7 @@ class MovingStore(LightingStore):
             tracer = Tracer(self.geometry.positions, self.geometry.faces[own])
             bits[rows] &= light_bits(tracer, lights, self.position[rows], self.normal[rows])[0]
             placed.light_bits = bits
-        return placed.light_bits
+        return placed.light_bits, lights
 
     def _past_what_stands(self) -> NDArray[np.uint8]:
         if self._now.lights == self.scene.lights:

@@ -177,6 +177,10 @@ def test_radiance_and_meshes_follow(store, tmp_path):
     radiance = formats.open_store(tmp_path / "a.zarr")
     about = formats.open_store(store).attrs["fields"]["objects"]
     rows = {name: slice(entry["first"], entry["first"] + entry["count"]) for name, entry in about.items()}
+    two = tmp_path / "two.zarr"
+    moves = ("ball=0,1.5,0", "block=2,0.5,0,0,90,0")
+    relight(Config(store=store, output=str(two), env="smooth", moves=moves, workers=2, quiet=True))
+    np.testing.assert_array_equal(formats.open_store(two).read("radiance"), radiance.read("radiance"))
     position = radiance.read("receivers/position")[0]
     np.testing.assert_allclose(position[rows["ball"]].mean(0), (0, 1.5, 0), atol=0.02)
     np.testing.assert_allclose(np.ptp(position[rows["block"]], axis=0), 1.0, atol=1e-9)
