@@ -18,7 +18,7 @@ from relightcli.core.shade.glossy import sky_tree, specular_radiance
 from relightcli.core.shade.irradiance import irradiance, moment_prefix
 from relightcli.core.shade.local import local_radiance
 from relightcli.core.sphere import haar, sh
-from relightcli.core.transport.local_lights import pack_lights
+from relightcli.core.transport.local_lights import LocalLights, pack_lights
 from relightcli.core.transport.receivers import receivers_of_vertices
 from relightcli.errors import InputError, StoreError
 from relightcli.scene.describe import scene_from_json
@@ -26,7 +26,9 @@ from relightcli.scene.model import Geometry, Material, Scene
 from relightcli.stages.rig_store import read_rigs
 
 if TYPE_CHECKING:
+    from relightcli.core.shade.bounces import Exit
     from relightcli.core.shade.gather import Gather
+    from relightcli.core.shade.lobe_factors import LobeFactors
 
 IN_MEMORY = 1 << 30  # visibility up to this size stays in memory between frames
 ENTRIES = 1 << 23  # of pixels' gathers that are made at a time
@@ -314,11 +316,11 @@ class LightingStore:
         self, coats: _Coats, view: NDArray[np.float32] | None, active: NDArray[np.bool_] | None
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]] | tuple[None, None]:
         """Irradiance (N, 3) of the local lights, and their specular light without its colour; None without lights."""
-        if "lights/bits" not in self.store:
+        lights = self._local_lights()
+        if lights is None:
             return None, None
         return local_radiance(
-            self.store.read("lights/bits"),
-            pack_lights(self.scene.lights.values()),
+            *lights,
             self.position,
             self.normal,
             view,
@@ -327,6 +329,13 @@ class LightingStore:
             np.ones(len(self), bool) if active is None else active,
             self.threads,
         )
+
+    def _local_lights(self) -> tuple[NDArray[np.uint8], LocalLights] | None:
+        """Bits of the local lights' points that every receiver sees, and the lights; None without lights."""
+        if "lights/bits" not in self.store:
+            return None
+        bits: Any = self.store.read("lights/bits")
+        return bits, pack_lights(self.scene.lights.values())
 
     def _bounces(
         self,
@@ -354,10 +363,11 @@ class LightingStore:
             sky = splat(latlong_to_cube(environment, gather.cells, rotate))
             for block, bits in self.blocks(first):
                 sky_lobes(bits, self.normal[block], coats.material[block], factors, sky, lobe, row[block], self.threads)
-            if "lights/bits" in self.store:
+            lights_seen = self._local_lights()
+            if lights_seen is not None:
                 local_lobes(
-                    self.store.read("lights/bits")[first:],
-                    pack_lights(self.scene.lights.values()),
+                    lights_seen[0][first:],
+                    lights_seen[1],
                     self.position[first:],
                     self.normal[first:],
                     coats.material[first:],
@@ -381,7 +391,7 @@ class LightingStore:
         for number in range(1, bounces + 1):
             light = Exit(diffuse if tint is None else diffuse * tint, lobe, row)
             e, specular, lobe = send(gather, first, light, number < bounces)
-            diffuse = self._reflected(coats, view, light.diffuse, e, specular)
+            diffuse = self._reflected(coats, view, light, factors, e, specular)
             if first:
                 lights.append(light)
                 arrived.append((e, specular))
@@ -399,12 +409,13 @@ class LightingStore:
         self,
         coats: _Coats,
         view: NDArray[np.float32] | None,
-        light: NDArray[np.float32],
+        light: Exit,
+        factors: LobeFactors,
         e: NDArray[np.float32],
         specular: NDArray[np.float32],
     ) -> NDArray[np.float32]:
-        """Diffuse exit radiance (N, 3) after one interreflection of `light` (N, 3), which gives irradiance e and
-        specular exit radiance, (N, 3) each. A store may add to the latter what else arrives."""
+        """Diffuse exit radiance (N, 3) after one interreflection of `light`, which gives irradiance e and specular
+        exit radiance, (N, 3) each. A store may add to the latter what else arrives."""
         return coats.diffuse(e)
 
     def gather(self, first: int = 0) -> Gather | None:

@@ -28,6 +28,7 @@ from relightcli.core.fields.shade import diffuse, never_negative, specular
 from relightcli.core.fields.standing import (
     CELLS,
     Views,
+    light_from_lobes,
     light_from_sky,
     light_from_surfaces,
     look_around,
@@ -35,12 +36,13 @@ from relightcli.core.fields.standing import (
     unhidden,
 )
 from relightcli.core.lights.environment import SkyCube, latlong_to_cube, splat
+from relightcli.core.shade.bounces import Exit
 from relightcli.core.shade.gather import Gather
-from relightcli.core.shade.local import local_radiance
+from relightcli.core.shade.lobe_factors import LobeFactors
 from relightcli.core.shade.low_order import response, shade_low_order
 from relightcli.core.sphere import sh
 from relightcli.core.transport.light_visibility import light_bits
-from relightcli.core.transport.local_lights import pack_lights
+from relightcli.core.transport.local_lights import LocalLights, pack_lights
 from relightcli.core.transport.transfer import local_rotations
 from relightcli.errors import InputError
 from relightcli.scene.model import Material
@@ -62,7 +64,7 @@ class _Placed:
     close: per mover its close points, and their rows; targets: slices of every mover's proxies and points;
     passed (n, N): what all movers let pass to the standing receivers; covered (receivers,): what nothing can see;
     views: what stands, from each mover's sites; thinned: the lookup with what stands before an entity taken off its
-    weight; gather, light_bits: of the standing receivers, once they are needed.
+    weight; gather of the standing receivers, light_bits of all, once they are needed.
     """
 
     entities: list[Entity]
@@ -301,33 +303,17 @@ class MovingStore(LightingStore):
         out[still] *= np.clip(passed, 0.0, 1.0)[:, None].astype(np.float32)
         return out
 
-    def _lamps(
-        self, coats: _Coats, view: NDArray[np.float32] | None, active: NDArray[np.bool_] | None
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]] | tuple[None, None]:
-        """Local lights on what stands, from bits: past what stands and, traced for every placement, what moves."""
+    def _local_lights(self) -> tuple[NDArray[np.uint8], LocalLights] | None:
+        """See `LightingStore._local_lights`: past what stands and, traced for every placement, what moves. Nothing of
+        what moves itself, which sees the lights' fields."""
         if not self._now.lights:
-            return None, None
-        n = self.static
-        e, shine = np.zeros((len(self), 3), np.float32), np.zeros((len(self), 3), np.float32)
-        e[:n], shine[:n] = local_radiance(
-            self._light_bits(),
-            pack_lights(self._now.lights.values()),
-            self.position[:n],
-            self.normal[:n],
-            None if view is None else view[:n],
-            coats.material[:n],
-            coats.table,
-            np.ones(n, bool) if active is None else active[:n],
-            self.threads,
-        )
-        return e, shine
-
-    def _light_bits(self) -> NDArray[np.uint8]:
-        """Points of the local lights that the standing receivers see, (n, points / 8)."""
+            return None
         placed, n = self._where(), self.static
+        lights = pack_lights(self._now.lights.values())
         if placed.light_bits is None:
-            lights = pack_lights(self._now.lights.values())
-            bits = self._past_what_stands().copy()
+            still = self._past_what_stands()
+            bits = np.zeros((len(self), still.shape[1]), np.uint8)
+            bits[:n] = still
             near = np.zeros(n, bool)
             for light in placed.entities[len(self.movers) :]:
                 for mover in placed.entities[: len(self.movers)]:
@@ -337,7 +323,7 @@ class MovingStore(LightingStore):
             tracer = Tracer(self.geometry.positions, self.geometry.faces[own])
             bits[rows] &= light_bits(tracer, lights, self.position[rows], self.normal[rows])[0]
             placed.light_bits = bits
-        return placed.light_bits
+        return placed.light_bits, lights
 
     def _past_what_stands(self) -> NDArray[np.uint8]:
         if self._now.lights == self.scene.lights:
@@ -371,14 +357,6 @@ class MovingStore(LightingStore):
             start = np.zeros(n + 1, np.int64)
             whole = Gather(CELLS, start, np.zeros(0, np.int32), np.zeros(0, np.int16), nothing, nothing)
         last = int(whole.start[n])
-        centers, radii = (np.array(x) for x in zip(*(_ball(e) for e in placed.entities), strict=True))
-        hidden = np.zeros((n, len(placed.entities), self.order**2), np.float32)
-        for e in range(len(self.movers)):
-            weight = placed.lookup.weight[:n, e]
-            rows = placed.rows[:, 0]
-            hidden[:, e, 0] = EVEN * weight.sum(axis=1)
-            for k in range(weight.shape[1]):
-                hidden[:, e] -= weight[:, k, None] * rows[placed.lookup.place[:n, e, k]]
         own = Gather(
             whole.cells,
             whole.start[: n + 1],
@@ -387,6 +365,17 @@ class MovingStore(LightingStore):
             whole.cosine[:last],
             whole.solid_angle[:last],
         )
+        if not last:
+            placed.gather = own
+            return own
+        centers, radii = (np.array(x) for x in zip(*(_ball(e) for e in placed.entities), strict=True))
+        hidden = np.zeros((n, len(placed.entities), self.order**2), np.float32)
+        for e in range(len(self.movers)):
+            weight = placed.lookup.weight[:n, e]
+            rows = placed.rows[:, 0]
+            hidden[:, e, 0] = EVEN * weight.sum(axis=1)
+            for k in range(weight.shape[1]):
+                hidden[:, e] -= weight[:, k, None] * rows[placed.lookup.place[:n, e, k]]
         placed.gather, share = dim(own, self.position, hidden, centers, radii, self.threads)
         placed.thinned.weight[:n] *= share[:, :, None]
         return placed.gather
@@ -395,7 +384,8 @@ class MovingStore(LightingStore):
         self,
         coats: _Coats,
         view: NDArray[np.float32] | None,
-        light: NDArray[np.float32],
+        light: Exit,
+        factors: LobeFactors,
         e: NDArray[np.float32],
         specular: NDArray[np.float32],
     ) -> NDArray[np.float32]:
@@ -405,16 +395,19 @@ class MovingStore(LightingStore):
         rows[:, 1:] = 0.0
         put_reflections(rows, placed.entities, placed.lookup, self._lights(placed), threads=self.threads)
         for (close, where), mover, entity in zip(placed.close, self.movers, placed.entities, strict=False):
-            rows[where, 1:] = sent(close, mover.body, light[mover.rows], entity.turn(self.order))
+            rows[where, 1:] = sent(close, mover.body, light.diffuse[mover.rows], entity.turn(self.order))
         none = np.zeros((3, self.order**2))
         arriving = light_at(_part(placed.thinned, slice(0, n)), rows, none, self.threads)
         e[:n] += self._irradiance_of(arriving)
         out = coats.diffuse(e)
         if view is not None:
             self._mirror(coats, view, arriving, specular)
-        standing = light.copy()
-        standing[n:] = 0.0
-        behind = [light_from_surfaces(views, standing, self.order, placed.covered) for views in placed.views]
+        behind = []
+        for views in placed.views:
+            behind.append(light_from_surfaces(views, light.diffuse, self.order, placed.covered))
+            if len(light.lobe):
+                normals, material = self.normal, coats.material
+                behind[-1] += light_from_lobes(views, light, normals, material, factors, self.order, placed.covered)
         self._light_movers(placed, rows, behind, view, out, specular)
         return out
 

@@ -14,6 +14,7 @@ import trimesh
 import relight_formats as formats
 from relightcli.errors import InputError
 from relightcli.scene.model import Camera
+from relightcli.stages.moving import MovingStore
 from relightcli.stages.relight import Config, relight
 from tests.core.transport.scenes import Part, lambert, sphere
 from tests.stages.scene_files import make_store, picture, read_layers, write_scene
@@ -147,6 +148,26 @@ def test_what_is_far_away_leaves_no_trace(store, tmp_path):
     np.testing.assert_allclose(found, wanted, atol=1e-4 * wanted.max())
 
 
+def test_no_light_comes_through_a_wall(tmp_path, library):
+    """A ball close behind a wall: what is before the wall gains 0.4 % of the brightest at most, and loses 2.4 %, as
+    four bands of what the ball hides reach around the wall."""
+    wall = grid(6, 24, 0.5)
+    turned = wall.corners[:, [1, 0, 2]] + np.array([0.0, 2.9, 0.0])
+    parts = {"wall": Part(turned, wall.triangles[:, ::-1], wall.normals[:, [1, 0, 2]], material=lambert(0.5))}
+    parts["wall"].two_sided = True
+    path = make_store(write(tmp_path, **parts), **SMALL, bounces=2, field_library=library)
+    lit = MovingStore(path, 1)
+    found = []
+    for moves in (("ball=-0.8,0.6,0", AWAY), ("ball=-1000,0,0", AWAY)):
+        lit.set_moves(moves)
+        found.append(lit.exit_radiance(smooth_sky().astype(np.float32), 0.0, lit.scene.materials, None))
+    before = lit.position[: lit.static, 0] > 0.05
+    for number in range(3):
+        a, b = (part[number].diffuse[: lit.static][before] for part in found)
+        assert (a - b).max() < 0.01 * b.max()
+        assert (b - a).max() < 0.05 * b.max()
+
+
 def test_frames_move_things(store, tmp_path):
     keys = tmp_path / "shots.toml"
     keys.write_text(
@@ -177,6 +198,10 @@ def test_radiance_and_meshes_follow(store, tmp_path):
     radiance = formats.open_store(tmp_path / "a.zarr")
     about = formats.open_store(store).attrs["fields"]["objects"]
     rows = {name: slice(entry["first"], entry["first"] + entry["count"]) for name, entry in about.items()}
+    two = tmp_path / "two.zarr"
+    moves = ("ball=0,1.5,0", "block=2,0.5,0,0,90,0")
+    relight(Config(store=store, output=str(two), env="smooth", moves=moves, workers=2, quiet=True))
+    np.testing.assert_array_equal(formats.open_store(two).read("radiance"), radiance.read("radiance"))
     position = radiance.read("receivers/position")[0]
     np.testing.assert_allclose(position[rows["ball"]].mean(0), (0, 1.5, 0), atol=0.02)
     np.testing.assert_allclose(np.ptp(position[rows["block"]], axis=0), 1.0, atol=1e-9)

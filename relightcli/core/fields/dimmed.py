@@ -16,7 +16,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from relightcli.core.fields.standing import cone_of
 from relightcli.core.lights.environment import SkyCube
 from relightcli.core.shade.gather import Gather, in_parts
 from relightcli.core.sphere import cube, sh
@@ -92,24 +91,27 @@ def _dim(  # type: ignore[no-untyped-def]
     first, last, start, source, cell, solid_angle, positions, directions, whole, y, hidden, centers, radii, cosine,
     solid, share,
 ):  # fmt: skip
-    inside = np.zeros(len(directions), np.bool_)
+    side = round(math.sqrt(len(directions) / 6))
+    narrow = 1.0 / math.sqrt(1.0 + 2.0 / (side * side))  # a cone of so large a cosine may have no cell's centre in it
     for i in range(first, last):
+        if start[i] == start[i + 1]:
+            continue
         p = positions[i]
         for e in range(len(centers)):
-            t = centers[e]
-            far = cone_of(p, t, radii[e], directions, inside)
-            covered = total = 0.0
-            if far > 0.0:
-                for k in range(len(directions)):
-                    if inside[k]:
-                        total += whole[k]
+            x, up, out = centers[e, 0] - p[0], centers[e, 1] - p[1], centers[e, 2] - p[2]
+            far2 = x * x + up * up + out * out
+            outside = far2 > radii[e] * radii[e]
+            least = math.inf  # of the distance of the ball's middle along a direction in its cone
+            if outside:
+                least = math.sqrt(far2) * min(math.sqrt(1.0 - radii[e] * radii[e] / far2), narrow)
+            covered = 0.0
             for z in range(start[i], start[i + 1]):
                 k = cell[z]
                 d, q = directions[k], positions[source[z]]
-                middle = d[0] * (t[0] - p[0]) + d[1] * (t[1] - p[1]) + d[2] * (t[2] - p[2])
+                middle = d[0] * x + d[1] * up + d[2] * out
                 distance = math.sqrt((q[0] - p[0]) ** 2 + (q[1] - p[1]) ** 2 + (q[2] - p[2]) ** 2)
                 if distance < middle:
-                    if inside[k]:
+                    if middle >= least:
                         covered += solid_angle[z]
                     continue
                 lost = 0.0
@@ -118,5 +120,10 @@ def _dim(  # type: ignore[no-untyped-def]
                 left = np.float32(max(1.0 - lost, 0.0))
                 cosine[z] *= left
                 solid[z] *= left
-            if total > 0.0:
+            if covered > 0.0:
+                total = 0.0
+                for k in range(len(directions)):
+                    d = directions[k]
+                    if d[0] * x + d[1] * up + d[2] * out >= least:
+                        total += whole[k]
                 share[i, e] = max(0.0, 1.0 - covered / total)

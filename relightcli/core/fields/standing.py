@@ -12,14 +12,17 @@ times w y_i, w the cell's solid angle. Points between sites take the nearest of 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from relightcli.core.brdf.separable import TERMS
 from relightcli.core.lights.environment import SkyCube
+from relightcli.core.shade.bounces import Exit
+from relightcli.core.shade.lobe_factors import LobeFactors, axes_of, send_lobe, waves
 from relightcli.core.sphere import cube, sh
 from relightcli.core.transport.tracer import Tracer
 
@@ -137,11 +140,56 @@ def _add_hits(receiver, share, exits, y, covered, out):  # type: ignore[no-untyp
                     out[s, c, i] += total * y[k, i]
 
 
+def light_from_lobes(
+    views: Views,
+    light: Exit,
+    normals: NDArray[np.float32],
+    material: NDArray[np.int32],
+    factors: LobeFactors,
+    order: int,
+    covered: NDArray[np.bool_],
+) -> NDArray[np.float32]:
+    """Light (S, 3, N) float32 of the surfaces' specular lobes, as `shade.bounces` sends it; of a face, that of the
+    corner next to the hit. normals, material of the receivers."""
+    directions = cube.texel_directions(CELLS).reshape(-1, 3)
+    weight = np.tile(cube.solid_angles(CELLS).reshape(-1), 6)
+    y = sh.harmonics(directions, order) * weight[:, None]
+    out = np.zeros((len(views.distance), 3, order * order))
+    _add_lobes(views.receiver, views.share, directions, light, normals, material, factors, y, covered, out)
+    return out.astype(np.float32)
+
+
+@njit(cache=True, error_model="numpy")
+def _add_lobes(  # type: ignore[no-untyped-def]
+    receiver, share, directions, light, normals, material, factors, y, covered, out
+):
+    wave = np.empty((2, TERMS), np.float32)
+    for s in range(len(receiver)):
+        for k in range(receiver.shape[1]):
+            at, most = -1, np.float32(0.0)
+            for j in range(3):
+                r = receiver[s, k, j]
+                if r >= 0 and not covered[r] and share[s, k, j] > most:
+                    at, most = r, share[s, k, j]
+            if at < 0 or light.row[at] < 0:
+                continue
+            m = material[at]
+            axes = axes_of((np.float64(normals[at, 0]), np.float64(normals[at, 1]), np.float64(normals[at, 2])))
+            back = (-directions[k, 0], -directions[k, 1], -directions[k, 2])
+            if not waves(factors.view_factor[m], axes, back, wave):
+                continue
+            found = send_lobe(wave, light.lobe[light.row[at]])
+            for c in range(3):
+                sent = max(found[c] * factors.colour[m, c], 0.0)
+                for i in range(y.shape[1]):
+                    out[s, c, i] += sent * y[k, i]
+
+
 def unhidden(
     views: Views, sites: NDArray[np.float64], center: NDArray[np.float64], radius: float
 ) -> NDArray[np.float32]:
-    """Share (S,) of a ball that nothing standing hides from the sites: of the cells in its cone, or of the one about
-    its centre, those that nothing blocks before the ball's middle."""
+    """Share (S,) of a ball that nothing standing hides from the sites: of the cells in its cone, which is taken as wide
+    as a cell at least, those that nothing blocks before the ball's middle."""
     solid = np.tile(cube.solid_angles(CELLS).reshape(-1), 6)
     directions = cube.texel_directions(CELLS).reshape(-1, 3)
     out = np.ones(len(sites), np.float32)
@@ -150,44 +198,24 @@ def unhidden(
 
 
 @njit(cache=True)
-def cone_of(p: Any, center: Any, radius: float, directions: Any, inside: Any) -> float:
-    """Marks the cells whose centres a ball covers from p, or the one nearest to its own; returns its distance, 0 from
-    inside, where none are."""
-    x, y, z = center[0] - p[0], center[1] - p[1], center[2] - p[2]
-    distance2 = x * x + y * y + z * z
-    inside[:] = False
-    if distance2 <= radius * radius:
-        return 0.0
-    distance = math.sqrt(distance2)
-    least = math.sqrt(1.0 - radius * radius / distance2)
-    best, nearest = -2.0, 0
-    for k in range(len(directions)):
-        d = (x * directions[k, 0] + y * directions[k, 1] + z * directions[k, 2]) / distance
-        inside[k] = d >= least
-        if d > best:
-            best, nearest = d, k
-    inside[nearest] = True
-    return distance
-
-
-@njit(cache=True)
 def _unhidden(distance, directions, solid, sites, center, radius, out):  # type: ignore[no-untyped-def]
-    inside = np.zeros(len(directions), np.bool_)
+    narrow = 1.0 / math.sqrt(1.0 + 2.0 / (CELLS * CELLS))  # a cone of a larger cosine may have no cell's centre in it
     for s in range(len(sites)):
-        p = sites[s]
-        far = cone_of(p, center, radius, directions, inside)
-        if far == 0.0:
+        x, y, z = center[0] - sites[s, 0], center[1] - sites[s, 1], center[2] - sites[s, 2]
+        far2 = x * x + y * y + z * z
+        if far2 <= radius * radius:
             continue
+        least = math.sqrt(far2) * min(math.sqrt(1.0 - radius * radius / far2), narrow)
         total = hidden = 0.0
         for k in range(len(directions)):
-            if inside[k]:
+            # Distance of the middle of the ball's chord along the cell's direction.
+            middle = directions[k, 0] * x + directions[k, 1] * y + directions[k, 2] * z
+            if middle >= least:
                 total += solid[k]
-                d = directions[k]
-                # Distance of the middle of the ball's chord along the cell's direction.
-                middle = d[0] * (center[0] - p[0]) + d[1] * (center[1] - p[1]) + d[2] * (center[2] - p[2])
                 if distance[s, k] < middle:
                     hidden += solid[k]
-        out[s] = 1.0 - hidden / total
+        if total > 0.0:
+            out[s] = 1.0 - hidden / total
 
 
 class Between(NamedTuple):
