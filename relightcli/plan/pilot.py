@@ -199,7 +199,8 @@ def share_of(
         return NOTHING
     share = math.sqrt(max(found, 0.0) / max(light, 1e-300))
     bound = math.sqrt(max(found + spread, 0.0) / (light - wide)) if light > wide else math.inf
-    least = math.sqrt(max(found - spread, 0.0) / (light + wide))
+    most = light + wide  # 0 where the two runs have lit no pixel both
+    least = math.sqrt(max(found - spread, 0.0) / most) if most > 0.0 else 0.0
     return Share(share, bound if found or spread else 0.0, least, where)
 
 

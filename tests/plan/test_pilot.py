@@ -207,3 +207,12 @@ def test_it_takes_a_moment_only():
     clock = time.perf_counter()
     plan_of(parts, ())
     assert time.perf_counter() - clock < 2.0 * 3  # 2 s are allowed alone on a machine
+
+
+def test_light_that_only_one_run_has_found_tells_nothing():
+    one, none = np.ones((4, 3)), np.zeros((4, 3))
+    share = pilot.share_of(none, none, one, none, "here")
+    assert (share.share, share.bound, share.least) == (0.0, 0.0, 0.0)
+    share = pilot.share_of(one, one, one, none, "here")
+    assert share.bound == np.inf
+    assert share.least == 0.0
