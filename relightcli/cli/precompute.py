@@ -107,7 +107,8 @@ def command(
     scene: Path, output: Path, workers: int | None, verbose: bool, quiet: bool, as_json: bool, **settings: Any
 ) -> None:
     """Simulate what every receiver of SCENE sees of the sky, and store it."""
-    from relightcli.stages.precompute import Config, precompute
+    from relightcli.stages.precompute import precompute
+    from relightcli.stages.precompute_config import Config
 
     config = Config(
         scene=scene,

@@ -29,7 +29,7 @@ from relightcli.stages.receiver_setup import MOST_PIXEL_GRID, PixelReceivers
 
 if TYPE_CHECKING:
     from relightcli.core.transport.receivers import Receivers
-    from relightcli.stages.precompute import Config
+    from relightcli.stages.precompute_config import Config
 
 RESOLUTIONS = (16, 32, 64, 128)  # to choose from
 DIRECT = 0.8  # of the tolerance: what direct light may be off by; the square of the rest is for what is left out

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from relightcli.adapters.images import read_image, write_image
-from relightcli.stages.precompute import Config as PrecomputeConfig
 from relightcli.stages.precompute import precompute
+from relightcli.stages.precompute_config import Config as PrecomputeConfig
 from relightcli.stages.relight import Config as RelightConfig
 from relightcli.stages.relight import relight
 

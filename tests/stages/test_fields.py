@@ -202,7 +202,8 @@ def test_membranes_that_move_are_refused(tmp_path):
 
 
 def test_dry_run_counts_the_rays_of_fields(scene):
-    from relightcli.stages.precompute import Config, precompute
+    from relightcli.stages.precompute import precompute
+    from relightcli.stages.precompute_config import Config
 
     config = Config(scene=scene, output=scene.parent / "no.zarr", **SMALL, dry_run=True, quiet=True)
     found = precompute(config)

@@ -12,7 +12,8 @@ from relightcli.run import blocks as run
 from relightcli.scene.model import Camera, Material
 from relightcli.stages import lighting, visibility_job
 from relightcli.stages import precompute as stage
-from relightcli.stages.precompute import Config, precompute
+from relightcli.stages.precompute import precompute
+from relightcli.stages.precompute_config import Config
 from relightcli.stages.relight import Config as RelightConfig
 from relightcli.stages.relight import relight
 from tests.core.shade.skies import smooth_map

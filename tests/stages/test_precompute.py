@@ -19,7 +19,8 @@ from relightcli.run import blocks as run
 from relightcli.scene.model import Camera, Material
 from relightcli.stages import precompute as stage
 from relightcli.stages import visibility_job
-from relightcli.stages.precompute import Config, precompute
+from relightcli.stages.precompute import precompute
+from relightcli.stages.precompute_config import Config
 from tests.core.transport.scenes import lambert, sphere, square
 from tests.stages.scene_files import make_store, picture, write_scene
 

@@ -12,7 +12,8 @@ from relightcli.adapters.images import write_image
 from relightcli.errors import InputError, NumericalError
 from relightcli.scene.model import Camera
 from relightcli.stages.measured_error import check_skies, edited, rows_of
-from relightcli.stages.precompute import Config, precompute
+from relightcli.stages.precompute import precompute
+from relightcli.stages.precompute_config import Config
 from relightcli.stages.relight import Config as RelightConfig
 from relightcli.stages.relight import relight
 from tests.core.transport.scenes import Part, lambert, sphere, square

@@ -1,0 +1,230 @@
+"""What stage precompute is to simulate: the scene with its faces cut, the plan, and the settings that follow."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from relightcli.adapters.rays import Tracer
+from relightcli.core.transport.receivers import Receivers
+from relightcli.core.transport.shading import shading_scene
+from relightcli.core.transport.tessellation import tessellate
+from relightcli.errors import InputError
+from relightcli.plan import effects, pilot
+from relightcli.scene.build import build_geometry
+from relightcli.scene.model import Geometry, Scene
+from relightcli.scene.parse import load_scene
+from relightcli.stages.fields import Moving, add_points, find_movers, place, without
+from relightcli.stages.precompute_config import RESOLUTION, Config, check_bounces, check_config
+from relightcli.stages.promise import try_resolutions
+from relightcli.stages.receiver_setup import (
+    PixelReceivers,
+    check_receivers,
+    make_receivers,
+    on_vertices,
+    unburied,
+    with_vertices,
+)
+
+MOVING = ("fields", "pose")  # effects
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A scene and what of it is simulated.
+
+    source: the meshes as the scene file has them; uncut: with faces cut that are too large to carry shadows; geometry:
+    the same, and with the meshes of what moves put in. both: objects whose back is lit too, (O,).
+    """
+
+    config: Config
+    scene: Scene
+    source: Geometry
+    uncut: Geometry
+    geometry: Geometry
+    both: NDArray[np.bool_]
+    plan: list[effects.Decision]
+    bounces: int
+    bounce_cells: int  # along a face of the cube of interreflections; 0: none
+    moving: Moving | None
+    promise: float | None  # the error to keep
+    resolution: int = RESOLUTION
+    tried: tuple[tuple[int, pilot.Share], ...] = ()  # resolutions, each with its error
+    planning_seconds: float = 0.0
+
+    @property
+    def simulated(self) -> list[str]:
+        """Names of the effects."""
+        return [d.effect for d in self.plan if d.simulate]
+
+    @property
+    def shadows(self) -> bool:
+        return "shadows" in self.simulated
+
+    @property
+    def posed(self) -> tuple[int, ...]:
+        """Objects that will stand otherwise when pictures are made: they block nothing for the receivers of others."""
+        if "pose" not in self.simulated:
+            return ()
+        rigs = self.geometry.rigs
+        return tuple(self.geometry.object_names.index(name) for name, rig in rigs.items() if rig.clips)
+
+    def plan_rows(self) -> list[dict[str, Any]]:
+        """The plan as it is stored; what was not measured is left out."""
+        return [_row(decision) for decision in self.plan]
+
+    def receivers(self) -> tuple[Receivers | PixelReceivers, NDArray[np.bool_] | None, tuple[int, ...]]:
+        """The receivers; which of them are buried, (N,), where there are any on vertices; and the first receiver of
+        what stays, then of everything that moves.
+
+        Pixels look at the `source`: they are the same, and lit the same, with and without interreflections.
+        """
+        config, scene, geometry, both = self.config, self.scene, self.geometry, self.both
+        move_aside = self.shadows and not config.dry_run
+        if self.moving is not None:
+            still = without(self.moving, geometry)
+            vertices, buried = on_vertices(still, both), np.zeros(0, bool)
+            if move_aside and len(vertices):
+                vertices, buried = unburied(still, vertices, self.posed)
+            vertices, starts = add_points(self.moving, self.uncut, geometry, vertices)
+            return vertices, np.concatenate([buried, np.zeros(len(vertices) - len(buried), bool)]), starts
+        seen = geometry if config.receivers == "vertices" else self.source
+        bounces = bool(self.bounce_cells)
+        asked = make_receivers(config.receivers, scene, seen, both, config.pixel_grid, fine=bounces)
+        if isinstance(asked, PixelReceivers) and not bounces:
+            return asked, None, (0,)
+        vertices = on_vertices(geometry, both) if isinstance(asked, PixelReceivers) else asked
+        buried = np.zeros(len(vertices), bool)
+        if move_aside:
+            vertices, buried = unburied(geometry, vertices, self.posed)
+        if isinstance(asked, PixelReceivers):
+            return with_vertices(asked, vertices), np.concatenate([np.zeros(len(asked), bool), buried]), (0,)
+        return vertices, buried, (0,)
+
+
+def prepare(config: Config) -> Prepared:
+    """Reads the scene and decides. Raises InputError where settings do not go with the scene."""
+    check_config(config)
+    asked = effects.parse_effects(config.effects)
+    wanted = effects.bounces_asked(asked, config.bounces)
+    promise = config.tolerance if config.basis == "visibility" else None
+    scene = load_scene(config.scene, allow_outside=config.allow_outside)
+    motions: dict[str, str] = {o.name: o.motion for o in scene.objects.values()}
+    source = build_geometry(scene)
+    both = _both_sides(scene, source)
+    check_receivers(config.receivers, scene, source)
+    if wanted:
+        check_bounces(config)
+    clock = time.perf_counter()
+    fields = effects.decide_fields(asked, motions, len(scene.lights))
+    plan, bounces = effects.decide(
+        asked,
+        source.positions,
+        source.faces,
+        bool(both.any()),
+        _lobes(scene),
+        wanted,
+        scene.tolerance if promise is None else promise,
+        lambda: _Pilot(scene, source),
+        fields.simulate,
+    )
+    planning = time.perf_counter() - clock
+    if bounces:
+        check_bounces(config)
+    plan.append(effects.decide_pose(asked, {name: len(rig.clips) for name, rig in source.rigs.items()}))
+    plan.append(fields)
+    simulated = [d.effect for d in plan if d.simulate]
+    if promise is not None and any(name in simulated for name in MOVING):
+        raise InputError(
+            f"--tolerance: {scene.path} has objects that move, and no error is promised for the light about them; "
+            "leave it out, or name effects without fields and pose"
+        )
+    shadows = "shadows" in simulated
+    bounce_cells = 0
+    if "one-bounce" in simulated:
+        coarse = (config.light_resolution or RESOLUTION) % 16
+        planned = 8 if coarse else effects.bounce_cells(plan, promise or scene.tolerance)
+        bounce_cells = config.bounce_resolution or planned
+    moving = _moving(config, scene) if fields.simulate else None
+    uncut = source
+    if shadows and config.subdivide and (config.receivers == "vertices" or bounce_cells):
+        uncut = _subdivided(source, moving)
+    geometry = uncut if moving is None else place(moving, uncut)
+    prepared = Prepared(
+        config,
+        scene,
+        source,
+        uncut,
+        geometry,
+        both,
+        plan,
+        bounces,
+        bounce_cells,
+        moving,
+        promise,
+        config.light_resolution or RESOLUTION,
+        planning_seconds=planning,
+    )
+    if config.light_resolution is None and promise is not None and shadows:
+        receivers, buried, _ = prepared.receivers()
+        tried = try_resolutions(config, scene, source, geometry, receivers, buried, promise)
+        return replace(prepared, resolution=tried[-1][0], tried=tuple(tried))
+    return prepared
+
+
+class _Pilot:
+    """See `plan.effects.Pilot`."""
+
+    def __init__(self, scene: Scene, geometry: Geometry) -> None:
+        self.scene = shading_scene(geometry, pilot.brightest(scene.materials.values()), scene.lights.values())
+        self.tracer = Tracer(geometry.positions, geometry.faces)
+        self.views = pilot.views(list(scene.cameras.values()), geometry.positions, geometry.faces)
+
+    def tails(self, allowed: float) -> list[pilot.Share]:
+        return pilot.tails(self.scene, self.tracer, self.views, allowed)
+
+    def shadows(self) -> pilot.Share:
+        return pilot.shadows(self.scene, self.tracer, self.views)
+
+
+def _row(decision: effects.Decision) -> dict[str, Any]:
+    """A row of the plan as it is stored; what was not measured is left out."""
+    row = {"effect": decision.effect, "simulate": decision.simulate, "evidence": decision.evidence}
+    measured = {"share": decision.share, "bound": decision.bound}
+    return row | {key: value for key, value in measured.items() if value is not None and math.isfinite(value)}
+
+
+def _moving(config: Config, scene: Scene) -> Moving:
+    """What may be moved. Raises InputError where receivers or settings do not go with it."""
+    config.fields.check()
+    if config.receivers != "vertices":
+        raise InputError("--receivers: objects that move carry their light at vertices; expected vertices")
+    return find_movers(scene, config.fields, config.subdivide, config.seed)
+
+
+def _subdivided(geometry: Geometry, moving: Moving | None) -> Geometry:
+    movers = () if moving is None else tuple(geometry.object_names.index(m.mesh.name) for m in moving.movers)
+    finer = tessellate(geometry, movers)
+    more = len(finer.positions) - len(geometry.positions)
+    if more == 0:
+        return geometry
+    note = f"faces too large to carry shadows were cut: {more} more vertices (--no-subdivide keeps them whole)"
+    return replace(finer, notes=(*geometry.notes, note))
+
+
+def _both_sides(scene: Scene, geometry: Geometry) -> NDArray[np.bool_]:
+    """Objects whose back is lit too: two-sided ones, and membranes that let light through."""
+    materials = list(scene.materials.values())
+    translucent = np.array([materials[m].model == "translucent" for m in geometry.material], bool)
+    both: NDArray[np.bool_] = geometry.two_sided | translucent
+    return both
+
+
+def _lobes(scene: Scene) -> bool:
+    """Whether any material has a specular lobe, or may be given one when a picture is made."""
+    return any(m.model not in ("lambert", "translucent") or m.adjustable for m in scene.materials.values())
