@@ -23,6 +23,7 @@ LAYERS = ("", "direct", "specular", "one_bounce", "two_bounce")
 LIMIT = {False: 3.0, True: 6.0}  # %, diffuse and glossy scenes
 FLIP_LIMIT = 0.05
 REPEATS = 3
+MOST = 4  # interreflections of the table over their number
 RECEIVERS = {
     "vertices": (),
     "pixels": ("--receivers", "pixels:main"),
@@ -31,13 +32,13 @@ RECEIVERS = {
 Picture = dict[str, NDArray[np.float32]]
 
 
-def read(path: Path) -> Picture:
-    """RGB of the beauty ("") and of every layer."""
+def read(path: Path, layers: tuple[str, ...] = LAYERS) -> Picture:
+    """RGB of the beauty ("") and of the layers."""
     from relightcli.adapters.images import read_image
 
     image = read_image(path)
     at = {name: image.pixels[..., k] for k, name in enumerate(image.names)}
-    return {name: np.stack([at[f"{name}.{c}" if name else c] for c in "RGB"], axis=-1) for name in LAYERS}
+    return {name: np.stack([at[f"{name}.{c}" if name else c] for c in "RGB"], axis=-1) for name in layers}
 
 
 def error(ours: NDArray[np.float32], a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
@@ -121,21 +122,48 @@ def measure(setting: Setting) -> Report:
             tuple(costs),
         )
     )
+    report.tables.append(more_bounces(setting, maps["overcast"], size, spp, cells))
     return report
 
 
-def _frames(store: Path, environment: Path) -> tuple[float, float]:
-    """Seconds a frame of a turning sky, without interreflections and with them."""
+def more_bounces(setting: Setting, sky: Path, size: tuple[int, int], spp: int, cells: int) -> Table:
+    """The first scene over the number of interreflections: error, what the next ones would add, seconds a frame."""
+    scene = MAKERS[0](cells)
+    assert scene is not None
+    folder = setting.work / "more"
+    store = folder / "more.zarr"
+    path = write(scene, folder, size)
+    run_tool("precompute", path, "-o", store, "--bounces", str(MOST), *setting.options)
+    edit = [word for change in scene.edit for word in ("--set", change)]
+    pictures = {}
+    for k in range(MOST + 1):
+        common = ("--env", sky, "--bounces", str(k), *edit)
+        run_tool("relight", store, *common, "-o", folder / f"{k}.exr")
+        found = [folder / f"{k}.exr"]
+        for seed in range(2):
+            found.append(folder / f"{k}-{seed}.exr")
+            run_tool("relight", store, *common, "-o", found[-1], "--reference", "--spp", str(spp), "--seed", str(seed))
+        pictures[k] = [read(p, ("",))[""] for p in found]
+    rows = []
+    for k, (ours, a, b) in pictures.items():
+        _, c, d = pictures[MOST]
+        rows.append((k, error(ours, a, b), error(ours, c, d), _frames(store, sky, (k,))[0]))
+    of = f"error against {MOST}, %"
+    return Table(f"{scene.name}: K interreflections", ("K", "error, %", of, "s a frame"), tuple(rows))
+
+
+def _frames(store: Path, environment: Path, numbers: tuple[int, ...] = (0, BOUNCES)) -> list[float]:
+    """Seconds a frame of a turning sky, for some numbers of interreflections."""
     shots = store.parent / "shots.toml"
     shots.write_text(
         f"format = 1\nframes = {REPEATS + 1}\n[[key]]\nframe = 1\nenv = '{environment}'\nenv_rotate = 0\n"
         "[[key]]\nframe = 5\nenv_rotate = 100\n"
     )
     out: list[float] = []
-    for bounces in (0, BOUNCES):
+    for bounces in numbers:
         _, told = run_tool(
             "relight", store, "--frames", shots, "-o", store.parent / "f##.exr", "--bounces", str(bounces)
         )
         told_frames: list[Any] = told["frame_seconds"]
         out.append(statistics.median(told_frames[1:]))  # the first reads the store
-    return out[0], out[1]
+    return out

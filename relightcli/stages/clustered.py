@@ -22,11 +22,12 @@ from relightcli.core.brdf.models import SPECULAR, MaterialTable, widen
 from relightcli.core.lights.environment import latlong_to_cube
 from relightcli.core.lights.leaf_light import LeafLight, Splitter
 from relightcli.core.lights.points import Points, split_points
-from relightcli.core.lights.quadtree import Tree, build_tree, leaves_at
+from relightcli.core.lights.quadtree import Tree, build_tree, first_leaves, leaves_at, solid_angles
 from relightcli.core.shade.cluster_sum import Fractions, Lobes
-from relightcli.core.transport.light_clusters import lobe_transfer
+from relightcli.core.shade.seen_points import point_irradiance, point_lobes
 from relightcli.errors import InputError, StoreError
 from relightcli.scene.model import Material
+from relightcli.stages.light_cluster_job import DIFFUSE
 from relightcli.stages.lighting import LightingStore, Radiance, _Coats
 
 PARTLY = 0.25  # of the clusters: if more have changed, all are summed again
@@ -40,6 +41,7 @@ class ClusteredStore(LightingStore):
         super().__init__(store, threads)
         self._sky: _ClusteredSky | None = None
         self._lobes: _BakedLobes | None = None
+        self._colour: tuple[_Coats, NDArray[np.float32]] | None = None
 
     def exit_radiance(
         self,
@@ -103,7 +105,12 @@ class ClusteredStore(LightingStore):
         diffuse = coats.diffuse(e)
         if not shines or view is None:
             return Radiance(diffuse, None)
-        colour = coats.table.parameters[coats.material][:, SPECULAR : SPECULAR + 3].astype(np.float32)
+        if self._colour is None or self._colour[0] is not coats:
+            self._colour = (
+                coats,
+                coats.table.parameters[:, SPECULAR : SPECULAR + 3].astype(np.float32)[coats.material],
+            )
+        colour = self._colour[1]
         if self._lobes is None:
             rows = np.flatnonzero(coats.shiny if looked_at is None else coats.shiny & looked_at)
             cells = latlong_to_cube(environment, self.resolution, rotate)
@@ -131,8 +138,12 @@ class _ClusteredSky:
         array: Any = lighting.store.array("light_clusters/fraction")
         step = array.chunks[1]
         columns = (np.asarray(array[:, a : a + step]) for a in range(0, array.shape[1], step))
-        radius = 0.5 * np.sqrt(read("light_clusters/solid_angle"))
+        whole = read(f"light_clusters/{DIFFUSE}")
+        radius = 0.5 * np.sqrt(solid_angles(whole, self.tree.resolution))
         self.fractions = Fractions(columns, lighting.normal, radius)
+        # A cell with fractions is a run of clusters: both are in the order of the trees.
+        self.first = first_leaves(self.tree, whole)
+        self.run_of = np.repeat(np.arange(len(whole)), np.diff(self.first, append=len(cells)))
         self.light: LeafLight | None = None
         self._groups: NDArray[np.float64] = np.zeros((0, 3, 64))
         self.points = Points(np.zeros((0, 3)), np.zeros((0, 3)))
@@ -172,11 +183,18 @@ class _ClusteredSky:
         if old is not None:
             changed = np.flatnonzero((new.moment != old.moment).any(axis=(1, 2)))
             if len(changed) <= PARTLY * len(new.moment):
-                self.fractions.change(self._groups, changed, old, new, threads)
+                runs = np.unique(self.run_of[changed])
+                self.fractions.change(self._groups, runs, self._runs(old), self._runs(new), threads)
                 self.light, self.changed = new, len(changed)
                 return
-        self._groups = self.fractions.sum(new, threads)
+        self._groups = self.fractions.sum(self._runs(new), threads)
         self.light, self.changed = new, None
+
+    def _runs(self, light: LeafLight) -> LeafLight:
+        """Light of the cells that have fractions."""
+        if len(self.first) == len(light.flux):
+            return light
+        return LeafLight(*(np.add.reduceat(values, self.first) for values in light))
 
     @property
     def irradiance(self) -> NDArray[np.float64]:
@@ -192,18 +210,17 @@ class _ClusteredSky:
 
     def of_points(self) -> NDArray[np.float64]:
         """Irradiance (N, 3) of the points."""
-        out = np.zeros((len(self.lighting), 3))
-        for direction, flux in zip(self.points.direction, self.points.flux, strict=True):
-            seen = np.flatnonzero(self.sees(direction))
-            cosine = np.maximum(self.lighting.normal[seen] @ direction, 0.0)
-            out[seen] += cosine[:, None] * flux
-        return out
+        return point_irradiance(self.seen(), self.points, self.lighting.normal, self.lighting.threads)
+
+    def seen(self) -> NDArray[np.bool_]:
+        """Who sees the points, (K, N)."""
+        return np.stack([self.sees(direction) for direction in self.points.direction])
 
     def sees(self, direction: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Receivers that see a direction, (N,): rays where its cluster is seen in part."""
         key = direction.tobytes()
         if key not in self._seen:
-            fraction = self.fractions.of(int(leaves_at(self.tree, direction[None])[0]))
+            fraction = self.fractions.of(int(self.run_of[leaves_at(self.tree, direction[None])[0]]))
             seen = fraction == 255
             light = direction.astype(np.float32)
             doubtful = np.flatnonzero((fraction > 0) & ~seen)
@@ -237,11 +254,11 @@ class _BakedLobes:
         self.view: NDArray[np.float32] = read("light_clusters/view")
         self.table = MaterialTable(read("light_clusters/model"), read("light_clusters/parameters"))
         self.lobes = Lobes(read("light_clusters/lobe"), read("light_clusters/lobe_scale"))
+        self._good: tuple[_Coats, NDArray[np.float32]] | None = None  # what has been checked
         self._of: LeafLight | None = None
         self._even: NDArray[np.float64] = np.zeros((len(self.rows), 3))
 
-    def shine(self, sky: _ClusteredSky, coats: _Coats, view: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(N, 3). Raises InputError for another view, or other lobes than were baked in."""
+    def _check(self, coats: _Coats, view: NDArray[np.float32]) -> None:
         lighting = self.lighting
         if not np.allclose(view[self.rows], self.view[self.rows], atol=1e-4):
             raise InputError(
@@ -261,6 +278,13 @@ class _BakedLobes:
                 f"{', '.join(names)}: another specular lobe than the clusters were made for; its colours may change, "
                 "for other changes use the transfer store it came from"
             )
+
+    def shine(self, sky: _ClusteredSky, coats: _Coats, view: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(N, 3). Raises InputError for another view, or other lobes than were baked in."""
+        lighting = self.lighting
+        if self._good is None or self._good[0] is not coats or self._good[1] is not view:
+            self._check(coats, view)
+            self._good = (coats, view)
         assert sky.light is not None
         if self._of is not sky.light:
             old = np.zeros_like(sky.light.flux) if self._of is None else self._of.flux
@@ -271,14 +295,17 @@ class _BakedLobes:
             self._even = self._even + self.lobes.sum(changed, sky.light.flux[changed] - old[changed], lighting.threads)
             self._of = sky.light
         total = self._even.copy()
-        for direction, flux in zip(sky.points.direction, sky.points.flux, strict=True):
-            seen = np.packbits(sky.sees(direction), bitorder="little")
-            words = np.zeros((1, -(-len(lighting) // 64)), np.uint64)
-            words.view(np.uint8)[0, : len(seen)] = seen
-            lobe = lobe_transfer(
-                words, direction[None], lighting.normal, self.view, self.rows, coats.material, self.table
-            )[0]
-            total += lobe[:, None] * flux
+        if len(sky.points.flux):
+            total += point_lobes(
+                sky.seen(),
+                sky.points,
+                lighting.normal,
+                self.view,
+                self.rows,
+                coats.material,
+                self.table,
+                lighting.threads,
+            )
         out = np.zeros((len(lighting), 3), np.float32)
         out[self.rows] = np.maximum(total, 0.0)
         return out

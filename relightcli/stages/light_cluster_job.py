@@ -26,7 +26,9 @@ from relightcli.run.blocks import Block, Info
 JUDGED = 8_192  # receivers with lobes that a cell is judged by, about
 KEPT = 2_048  # transfer vectors that a process keeps for the neighbours of a cell
 CHECKS = 256  # random lights at which the clusters are compared with rays
+MATTE = 0.5  # of epsilon: the error of the fractions, where lobes have smaller clusters
 FINEST_STEP = 0.5  # of a lobe's transfer, in parts of epsilon: its rounding, even over a step, is 0.14 epsilon
+DIFFUSE = "diffuse_cell"  # cells with fractions: all, or where lobes are baked in the larger ones of diffuse light
 SCRATCH = "bits.partial"  # visibility by texel, while the store is written
 
 
@@ -38,7 +40,10 @@ def as_cell(values: list[int]) -> Cell:
 
 @dataclass(frozen=True)
 class ClusterJob:
-    """Refines cells, or fills the fractions of leaves that are known. `cells`: one for each block to refine."""
+    """Refines cells, or fills the fractions of leaves that are known. `cells`: one for each block to refine.
+
+    matte: for cells that are good enough for diffuse light alone, none smaller than the known leaves.
+    """
 
     partial: str
     resolution: int
@@ -47,6 +52,7 @@ class ClusterJob:
     shadows: bool
     lobes: bool
     cells: tuple[Cell, ...] = ()
+    matte: bool = False
 
     def open(self) -> ClusterWorker:
         return ClusterWorker(self)
@@ -72,13 +78,14 @@ class ClusterWorker:
         self.reflectance: NDArray[np.float64] = read("light_clusters/reflectance")
         self.kept: dict[int, NDArray[np.uint64]] = {}
         self.lobes = _Lobes(self, read) if job.lobes else None
+        self.leaves = {as_cell(c) for c in read("light_clusters/cell")} if job.matte else set()
 
     def run(self, block: Block) -> Info:
         rays = self.vectors.rays
-        if block.id.startswith("refine/"):
+        if self.job.cells:
             info: Info = {"leaves": self.refine(self.job.cells[block.start])}
         else:
-            info = self.fill(block)
+            info = self.fill_lobes(block) if block.id.startswith("lobe/") else self.fill(block)
         return {**info, "rays": float(self.vectors.rays - rays)}
 
     def refine(self, cell: Cell) -> list[Cell]:
@@ -94,6 +101,8 @@ class ClusterWorker:
 
     def accepts(self, cell: Cell) -> bool:
         """Whether the cell is one cluster: all its samples are within epsilon, a single light always."""
+        if self.job.matte:
+            return cell in self.leaves or self.worst(cell) < MATTE * self.job.epsilon
         return quadtree.lights(cell) == 1 or self.worst(cell) < self.job.epsilon
 
     def worst(self, cell: Cell) -> float:
@@ -141,6 +150,8 @@ class ClusterWorker:
         """Error of every sample, and of even light, by area-weighted RMS."""
         radius = self.radius(cell)
         if self.lobes is not None:
+            if self.job.matte:
+                return self.lobes.matte_errors(visible, directions, radius)
             return self.lobes.errors(visible, directions, radius)
         return np.sqrt(measure.visibility_errors(visible, directions, radius, self.normal, self.area))
 
@@ -149,32 +160,44 @@ class ClusterWorker:
         return 0.5 * math.sqrt(float(quadtree.solid_angles(np.array([cell]), self.job.resolution)[0]))
 
     def fill(self, block: Block) -> Info:
-        """Writes the fractions, lobes and errors of a range of leaves."""
-
-        def out(name: str) -> Any:
-            return formats.worker_array(self.job.partial, f"light_clusters/{name}")
-
-        rows = slice(block.start, block.stop)
-        cells = [as_cell(c) for c in out("cell")[rows]]
+        """Writes the fractions of a range of the cells that have them, and without lobes the errors."""
+        rows, cells = self.cells_of(block, DIFFUSE)
         fraction = np.zeros((len(cells), len(self.normal)), np.uint8)
-        error, paper = np.zeros(len(cells), np.float32), np.zeros(len(cells), np.float32)
-        lobes, scales = [], []
         for k, cell in enumerate(cells):
             visible, directions = self.nine(cell) if self.job.criterion == "paper" else self.known(cell)
             fraction[k] = measure.fractions(visible, directions, self.radius(cell), self.normal)
+        self.out("fraction")[rows] = fraction
+        if self.lobes is None:
+            self.put_errors(rows, cells)
+        return {"clusters": len(cells)}
+
+    def fill_lobes(self, block: Block) -> Info:
+        """Writes the lobes and the errors of a range of leaves."""
+        assert self.lobes is not None
+        rows, cells = self.cells_of(block, "cell")
+        found = [
+            self.lobes.mean(*(self.nine(cell) if self.job.criterion == "paper" else self.known(cell))) for cell in cells
+        ]
+        self.out("lobe")[rows] = np.stack([lobe for lobe, _ in found])
+        self.out("lobe_scale")[rows] = np.stack([scale for _, scale in found])
+        self.put_errors(rows, cells)
+        return {"clusters": len(cells)}
+
+    def put_errors(self, rows: slice, cells: list[Cell]) -> None:
+        error, paper = np.zeros(len(cells), np.float32), np.zeros(len(cells), np.float32)
+        for k, cell in enumerate(cells):
+            visible, directions = self.nine(cell) if self.job.criterion == "paper" else self.known(cell)
             error[k] = self.rms(cell, visible, directions).max()
             paper[k] = measure.paper_errors(*self.nine(cell), self.normal, self.reflectance).max()
-            if self.lobes is not None:
-                lobe, scale = self.lobes.mean(visible, directions)
-                lobes.append(lobe)
-                scales.append(scale)
-        out("fraction")[rows] = fraction
-        out("error")[rows] = error
-        out("paper_error")[rows] = paper
-        if lobes:
-            out("lobe")[rows] = np.stack(lobes)
-            out("lobe_scale")[rows] = np.stack(scales)
-        return {"clusters": len(cells)}
+        self.out("error")[rows] = error
+        self.out("paper_error")[rows] = paper
+
+    def cells_of(self, block: Block, name: str) -> tuple[slice, list[Cell]]:
+        rows = slice(block.start, block.stop)
+        return rows, [as_cell(c) for c in self.out(name)[rows]]
+
+    def out(self, name: str) -> Any:
+        return formats.worker_array(self.job.partial, f"light_clusters/{name}")
 
     def check(self, leaves: list[Cell], seed: int) -> Info:
         """RMS error at lights that the clusters were not made from, uniform over the sphere."""
@@ -183,7 +206,7 @@ class ClusterWorker:
         d /= np.linalg.norm(d, axis=1, keepdims=True)
         leaf = quadtree.leaves_at(quadtree.build_tree(leaves, self.job.resolution), d)
         visible = self.vectors.visible(d)
-        array: Any = formats.worker_array(self.job.partial, "light_clusters/fraction")
+        array = self.out("fraction")
         square, worst = 0.0, 0.0
         step = array.chunks[0]
         for start in np.unique(leaf // step) * step:
@@ -252,6 +275,14 @@ class _Lobes:
         """Of some receivers, (S, n)."""
         w = self.worker
         return measure.lobe_transfer(visible, directions, w.normal, self.view, rows, self.material, self.table)
+
+    def matte_errors(
+        self, visible: NDArray[np.uint64], directions: NDArray[np.float64], radius: float
+    ) -> NDArray[np.float64]:
+        """Error of diffuse light alone, relative to the same reference."""
+        w = self.worker
+        area = w.area * self.diffuse**2
+        return np.sqrt(measure.visibility_errors(visible, directions, radius, w.normal, area))
 
     def errors(
         self, visible: NDArray[np.uint64], directions: NDArray[np.float64], radius: float

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +29,14 @@ from relightcli.core.transport.receivers import receiver_areas
 from relightcli.errors import InputError, StoreError
 from relightcli.run import blocks as run
 from relightcli.stages.cluster import copy_arrays
-from relightcli.stages.light_cluster_job import SCRATCH, ClusterJob, ClusterWorker, as_cell
+from relightcli.stages.light_cluster_job import DIFFUSE, SCRATCH, ClusterJob, ClusterWorker, as_cell
 from relightcli.stages.lighting import SHINY, LightingStore, need_still
 from relightcli.stages.outputs import resolve_camera
 
 KIND = "light_clusters"
 MOST_RESOLUTION = 4096
 EPSILON = {"rms": 0.0425, "paper": 5e-5}
+CELL = "face_row0_row1_column0_column1"
 SPLIT_LEVEL = 3  # cells of this level are refined apart, each in one block
 ROUND = 64  # cells that are split in one round of a budget, at least
 CLUSTERS = 256  # per block and chunk
@@ -118,29 +119,34 @@ def cluster_lights(config: Config) -> dict[str, Any]:
             str(writer.partial_path), config.resolution, epsilon, config.criterion, shadows, view is not None
         )
         if config.lights is None and config.seconds is None:
-            leaves = _refine(job, writer, config)
+            leaves = _refine(job, writer, config, "")
         else:
             leaves = _spend(job, writer, config)
         leaves = _in_order(leaves, config.resolution)
         cells = np.array(leaves, np.int32)
-        writer.put("light_clusters/cell", cells, dims=("cluster", "face_row0_row1_column0_column1"))
+        writer.put("light_clusters/cell", cells, dims=("cluster", CELL))
         writer.put(
             "light_clusters/solid_angle",
             quadtree.solid_angles(cells, config.resolution),
             dims=("cluster",),
             units="sr",
         )
-        _create_outputs(writer, len(leaves), len(lighting), _lobe_count(writer) if view is not None else 0)
+        diffuse = leaves
+        if view is not None and config.criterion == "rms":
+            diffuse = _in_order(_refine(replace(job, matte=True), writer, config, "matte-"), config.resolution)
+        writer.put(f"light_clusters/{DIFFUSE}", np.array(diffuse, np.int32), dims=("diffuse_cluster", CELL))
+        lobed = _lobe_count(writer) if view is not None else 0
+        _create_outputs(writer, len(leaves), len(diffuse), len(lighting), lobed)
         run.run_blocks(
             job,
-            run.split("fraction", len(leaves), CLUSTERS),
+            run.split("fraction", len(diffuse), CLUSTERS) + (run.split("lobe", len(leaves), CLUSTERS) if lobed else []),
             writer,
             workers=config.workers,
             label="clusters",
             quiet=config.quiet,
         )
         if "check" not in writer.done:
-            writer.record("check", job.open().check(leaves, config.seed))
+            writer.record("check", job.open().check(diffuse, config.seed))
         run.close_worker()
         del base
         writer.commit({"seconds": time.perf_counter() - started, "resumed": resumed, "workers": config.workers})
@@ -219,65 +225,62 @@ def _lobe_count(writer: formats.Writer) -> int:
     return int(formats.worker_array(writer.partial_path, "light_clusters/lobed").shape[0])
 
 
-def _create_outputs(writer: formats.Writer, clusters: int, receivers: int, lobed: int) -> None:
+def _create_outputs(writer: formats.Writer, clusters: int, diffuse: int, receivers: int, lobed: int) -> None:
     def array(
-        name: str, dtype: Any, second: tuple[int, str] | None, description: str, units: str | None = None
+        name: str, dtype: Any, shape: tuple[int, ...], dims: tuple[str, ...], text: str, units: str | None = None
     ) -> None:
-        wide = () if second is None else (second[0],)
         writer.array(
             f"light_clusters/{name}",
-            shape=(clusters, *wide),
+            shape=shape,
             dtype=dtype,
-            chunks=(CLUSTERS, *(min(n, RECEIVERS) for n in wide)),
-            dims=("cluster", *(() if second is None else (second[1],))),
+            chunks=(CLUSTERS, *(min(n, RECEIVERS) for n in shape[1:])),
+            dims=dims,
             units=units,
-            attrs={"description": description},
+            attrs={"description": text},
             codec="zstd",
         )
 
-    array("fraction", np.uint8, (receivers, "receiver"), "visible part of the cluster, in steps of 1/255")
-    array("error", np.float32, None, "largest of the samples' errors by area-weighted RMS, 1 is a light overhead")
-    array("paper_error", np.float32, None, "largest of the samples' errors as in Johan and Nishita, Eq. 11")
+    visible = "visible part of the cluster, in steps of 1/255"
+    array("fraction", np.uint8, (diffuse, receivers), ("diffuse_cluster", "receiver"), visible)
+    one = ((clusters,), ("cluster",))
+    array("error", np.float32, *one, "largest of the samples' errors by area-weighted RMS, 1 is a light overhead")
+    array("paper_error", np.float32, *one, "largest of the samples' errors as in Johan and Nishita, Eq. 11")
     if lobed:
         groups = -(-lobed // GROUP)
-        array("lobe", np.uint8, (lobed, "lobed"), "transfer by the specular lobe, in steps of the group's scale")
-        array("lobe_scale", np.float32, (groups, "lobed_group"), "a step of `lobe` for 64 receivers", "sr-1")
+        steps = "transfer by the specular lobe, in steps of the group's scale"
+        array("lobe", np.uint8, (clusters, lobed), ("cluster", "lobed"), steps)
+        scale = "a step of `lobe` for 64 receivers"
+        array("lobe_scale", np.float32, (clusters, groups), ("cluster", "lobed_group"), scale, "sr-1")
 
 
-def _refine(job: ClusterJob, writer: formats.Writer, config: Config) -> list[Cell]:
-    """All leaves: the upper levels here, the rest in blocks of one cell each."""
+def _refine(job: ClusterJob, writer: formats.Writer, config: Config, prefix: str) -> list[Cell]:
+    """All leaves: the upper levels here, the rest in blocks of one cell each, their names starting with `prefix`."""
     level, leaves = quadtree.roots(config.resolution), []
-    if "roots" not in writer.done:
+    top = f"{prefix}roots"
+    if top not in writer.done:
         worker = job.open()
         clock = time.perf_counter()
         for _ in range(SPLIT_LEVEL):
             inner = [cell for cell in level if not worker.accepts(cell)]
             leaves += [cell for cell in level if cell not in set(inner)]
             level = [part for cell in inner for part in quadtree.children(cell)]
-        writer.record(
-            "roots",
-            {
-                "seconds": time.perf_counter() - clock,
-                "rays": float(worker.vectors.rays),
-                "leaves": leaves,
-                "cells": level,
-            },
-        )
+        seconds, rays = time.perf_counter() - clock, float(worker.vectors.rays)
+        writer.record(top, {"seconds": seconds, "rays": rays, "leaves": leaves, "cells": level})
     known = {block["id"]: block for block in writer.blocks}
-    leaves = [as_cell(c) for c in known["roots"]["leaves"]]
-    cells = [as_cell(c) for c in known["roots"]["cells"]]
+    leaves = [as_cell(c) for c in known[top]["leaves"]]
+    cells = [as_cell(c) for c in known[top]["cells"]]
     if not cells:
         return leaves
     run.run_blocks(
-        ClusterJob(job.partial, job.resolution, job.epsilon, job.criterion, job.shadows, job.lobes, tuple(cells)),
-        run.split("refine", len(cells), 1),
+        replace(job, cells=tuple(cells)),
+        run.split(f"{prefix}refine", len(cells), 1),
         writer,
         workers=config.workers,
         label="light",
         quiet=config.quiet,
     )
     for block in writer.blocks:
-        if block["id"].startswith("refine/"):
+        if block["id"].startswith(f"{prefix}refine/"):
             leaves += [as_cell(c) for c in block["leaves"]]
     return leaves
 

@@ -400,6 +400,14 @@ def test_specular_lobes_of_a_fixed_view(glossy):
         picture(store, "c.exr", camera="other")
     with pytest.raises(InputError, match="ball: another specular lobe than the clusters were made for"):
         picture(store, "c.exr", settings=("ball.roughness=0.5",))
+    # Diffuse light has larger cells, each of them a run of the lobes' clusters.
+    opened = formats.open_store(store)
+    cells, larger = opened.read("light_clusters/cell"), opened.read("light_clusters/diffuse_cell")
+    assert len(larger) < 0.7 * len(cells)
+    assert opened.layouts["light_clusters/fraction"].shape[0] == len(larger)
+    sky = ClusteredStore(store, 1).sky
+    solid = np.add.reduceat(opened.read("light_clusters/solid_angle"), sky.first)
+    np.testing.assert_allclose(solid, quadtree.solid_angles(larger, 64), rtol=1e-12)
 
 
 def test_without_a_fixed_view_every_view_and_lobe_will_do(glossy):

@@ -183,6 +183,14 @@ def leaves_at(tree: Tree, directions: NDArray[np.floating]) -> NDArray[np.int64]
     return out
 
 
+def first_leaves(tree: Tree, cells: NDArray[np.integer]) -> NDArray[np.int64]:
+    """First leaf (m,) of cells (m, 5) that are nodes of the tree, whose leaves are in its order."""
+    face, row, _, column, _ = np.asarray(cells, np.int64).T
+    out = np.empty(len(cells), np.int64)
+    _leaves_of(tree, face, row, column, out)
+    return out
+
+
 @njit(cache=True)
 def _leaves_of(tree, face, row, column, out):  # type: ignore[no-untyped-def]
     for k in range(len(out)):
