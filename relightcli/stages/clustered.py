@@ -27,10 +27,11 @@ from relightcli.core.shade.cluster_sum import Fractions, Lobes
 from relightcli.core.shade.seen_points import point_irradiance, point_lobes
 from relightcli.errors import InputError, StoreError
 from relightcli.scene.model import Material
-from relightcli.stages.light_cluster_job import DIFFUSE
+from relightcli.stages.light_cluster_job import DIFFUSE, LOBE
 from relightcli.stages.lighting import LightingStore, Radiance, _Coats
 
 PARTLY = 0.25  # of the clusters: if more have changed, all are summed again
+MANY = 64  # cells that are not summed one by one
 KEPT = 256  # points whose visibility is kept
 
 
@@ -93,7 +94,7 @@ class ClusteredStore(LightingStore):
         shines = bool(coats.shiny.any()) and view is not None
         baked = "light_clusters/lobe" in self.store or "visibility/bits" not in self.store
         if shines and baked and self._lobes is None:
-            self._lobes = _BakedLobes(self)
+            self._lobes = _BakedLobes(self, sky.tree)
         sky.set_light(environment, rotate)
         total = sky.irradiance
         if len(sky.points.flux):
@@ -122,6 +123,28 @@ class ClusteredStore(LightingStore):
         return Radiance(diffuse, specular)
 
 
+class Runs:
+    """Cells (m, 5) that are runs of a tree's leaves, both in the order of the trees.
+
+    first (m,): the first leaf of each; of (l,): the cell that holds a leaf.
+    """
+
+    def __init__(self, tree: Tree, cells: NDArray[np.int32]) -> None:
+        self.first = first_leaves(tree, cells)
+        self.of = np.repeat(np.arange(len(cells)), np.diff(self.first, append=len(tree.cell)))
+
+    def sum(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(m, ...) of values (l, ...)."""
+        return values if len(self.first) == len(values) else np.add.reduceat(values, self.first)
+
+    def sums(self, values: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Of some cells."""
+        if len(cells) > MANY:
+            return self.sum(values)[cells]
+        last = np.append(self.first, len(values))
+        return np.stack([values[last[k] : last[k + 1]].sum(axis=0) for k in cells])
+
+
 class _ClusteredSky:
     """The map in clusters, and its points.
 
@@ -138,12 +161,10 @@ class _ClusteredSky:
         array: Any = lighting.store.array("light_clusters/fraction")
         step = array.chunks[1]
         columns = (np.asarray(array[:, a : a + step]) for a in range(0, array.shape[1], step))
-        whole = read(f"light_clusters/{DIFFUSE}")
-        radius = 0.5 * np.sqrt(solid_angles(whole, self.tree.resolution))
+        own = read(f"light_clusters/{DIFFUSE}")
+        radius = 0.5 * np.sqrt(solid_angles(own, self.tree.resolution))
         self.fractions = Fractions(columns, lighting.normal, radius)
-        # A cell with fractions is a run of clusters: both are in the order of the trees.
-        self.first = first_leaves(self.tree, whole)
-        self.run_of = np.repeat(np.arange(len(whole)), np.diff(self.first, append=len(cells)))
+        self.runs = Runs(self.tree, own)
         self.light: LeafLight | None = None
         self._groups: NDArray[np.float64] = np.zeros((0, 3, 64))
         self.points = Points(np.zeros((0, 3)), np.zeros((0, 3)))
@@ -183,18 +204,13 @@ class _ClusteredSky:
         if old is not None:
             changed = np.flatnonzero((new.moment != old.moment).any(axis=(1, 2)))
             if len(changed) <= PARTLY * len(new.moment):
-                runs = np.unique(self.run_of[changed])
-                self.fractions.change(self._groups, runs, self._runs(old), self._runs(new), threads)
+                runs = np.unique(self.runs.of[changed])
+                before, after = (LeafLight(*(self.runs.sums(v, runs) for v in light)) for light in (old, new))
+                self.fractions.change(self._groups, runs, before, after, threads)
                 self.light, self.changed = new, len(changed)
                 return
-        self._groups = self.fractions.sum(self._runs(new), threads)
+        self._groups = self.fractions.sum(LeafLight(*map(self.runs.sum, new)), threads)
         self.light, self.changed = new, None
-
-    def _runs(self, light: LeafLight) -> LeafLight:
-        """Light of the cells that have fractions."""
-        if len(self.first) == len(light.flux):
-            return light
-        return LeafLight(*(np.add.reduceat(values, self.first) for values in light))
 
     @property
     def irradiance(self) -> NDArray[np.float64]:
@@ -220,7 +236,7 @@ class _ClusteredSky:
         """Receivers that see a direction, (N,): rays where its cluster is seen in part."""
         key = direction.tobytes()
         if key not in self._seen:
-            fraction = self.fractions.of(int(self.run_of[leaves_at(self.tree, direction[None])[0]]))
+            fraction = self.fractions.of(int(self.runs.of[leaves_at(self.tree, direction[None])[0]]))
             seen = fraction == 255
             light = direction.astype(np.float32)
             doubtful = np.flatnonzero((fraction > 0) & ~seen)
@@ -242,7 +258,7 @@ class _ClusteredSky:
 class _BakedLobes:
     """Specular light of the view that the clusters were made for, without the specular colours."""
 
-    def __init__(self, lighting: ClusteredStore) -> None:
+    def __init__(self, lighting: ClusteredStore, tree: Tree) -> None:
         self.lighting = lighting
         store = lighting.store
         if "light_clusters/lobe" not in store:
@@ -255,8 +271,10 @@ class _BakedLobes:
         self.table = MaterialTable(read("light_clusters/model"), read("light_clusters/parameters"))
         self.lobes = Lobes(read("light_clusters/lobe"), read("light_clusters/lobe_scale"))
         self._good: tuple[_Coats, NDArray[np.float32]] | None = None  # what has been checked
+        self.runs = Runs(tree, read(f"light_clusters/{LOBE}"))
         self._of: LeafLight | None = None
-        self._even: NDArray[np.float64] = np.zeros((len(self.rows), 3))
+        self._flux: NDArray[np.float64] | None = None
+        self._even = self.lobes.dark()
 
     def _check(self, coats: _Coats, view: NDArray[np.float32]) -> None:
         lighting = self.lighting
@@ -287,16 +305,17 @@ class _BakedLobes:
             self._good = (coats, view)
         assert sky.light is not None
         if self._of is not sky.light:
-            old = np.zeros_like(sky.light.flux) if self._of is None else self._of.flux
-            changed = np.flatnonzero((sky.light.flux != old).any(axis=1))
+            flux = self.runs.sum(sky.light.flux)
+            old = np.zeros_like(flux) if self._flux is None else self._flux
+            changed = np.flatnonzero((flux != old).any(axis=1))
             if len(changed) > PARTLY * len(old):
                 changed, old = np.arange(len(old)), np.zeros_like(old)
-                self._even = np.zeros_like(self._even)
-            self._even = self._even + self.lobes.sum(changed, sky.light.flux[changed] - old[changed], lighting.threads)
-            self._of = sky.light
-        total = self._even.copy()
+                self._even = self.lobes.dark()
+            self.lobes.add(self._even, changed, flux[changed] - old[changed], lighting.threads)
+            self._of, self._flux = sky.light, flux
+        more = None
         if len(sky.points.flux):
-            total += point_lobes(
+            more = point_lobes(
                 sky.seen(),
                 sky.points,
                 lighting.normal,
@@ -306,9 +325,7 @@ class _BakedLobes:
                 self.table,
                 lighting.threads,
             )
-        out = np.zeros((len(lighting), 3), np.float32)
-        out[self.rows] = np.maximum(total, 0.0)
-        return out
+        return self.lobes.put(self._even, more, self.rows, len(lighting))
 
 
 def changed_rows(old: NDArray[np.float32], new: NDArray[np.float32]) -> NDArray[np.int64]:

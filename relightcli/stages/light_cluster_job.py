@@ -26,9 +26,9 @@ from relightcli.run.blocks import Block, Info
 JUDGED = 8_192  # receivers with lobes that a cell is judged by, about
 KEPT = 2_048  # transfer vectors that a process keeps for the neighbours of a cell
 CHECKS = 256  # random lights at which the clusters are compared with rays
-MATTE = 0.5  # of epsilon: the error of the fractions, where lobes have smaller clusters
+PART = {"all": 1.0, "diffuse": 0.38, "lobes": 0.78}  # of epsilon: parts of the light have cells of their own
 FINEST_STEP = 0.5  # of a lobe's transfer, in parts of epsilon: its rounding, even over a step, is 0.14 epsilon
-DIFFUSE = "diffuse_cell"  # cells with fractions: all, or where lobes are baked in the larger ones of diffuse light
+DIFFUSE, LOBE = "diffuse_cell", "lobe_cell"  # cells with fractions, and with lobes: each a run of clusters
 SCRATCH = "bits.partial"  # visibility by texel, while the store is written
 
 
@@ -42,7 +42,7 @@ def as_cell(values: list[int]) -> Cell:
 class ClusterJob:
     """Refines cells, or fills the fractions of leaves that are known. `cells`: one for each block to refine.
 
-    matte: for cells that are good enough for diffuse light alone, none smaller than the known leaves.
+    part: what a cell has to be good enough for: all its light, or diffuse light or that of lobes alone.
     """
 
     partial: str
@@ -52,7 +52,7 @@ class ClusterJob:
     shadows: bool
     lobes: bool
     cells: tuple[Cell, ...] = ()
-    matte: bool = False
+    part: str = "all"
 
     def open(self) -> ClusterWorker:
         return ClusterWorker(self)
@@ -78,7 +78,6 @@ class ClusterWorker:
         self.reflectance: NDArray[np.float64] = read("light_clusters/reflectance")
         self.kept: dict[int, NDArray[np.uint64]] = {}
         self.lobes = _Lobes(self, read) if job.lobes else None
-        self.leaves = {as_cell(c) for c in read("light_clusters/cell")} if job.matte else set()
 
     def run(self, block: Block) -> Info:
         rays = self.vectors.rays
@@ -101,9 +100,7 @@ class ClusterWorker:
 
     def accepts(self, cell: Cell) -> bool:
         """Whether the cell is one cluster: all its samples are within epsilon, a single light always."""
-        if self.job.matte:
-            return cell in self.leaves or self.worst(cell) < MATTE * self.job.epsilon
-        return quadtree.lights(cell) == 1 or self.worst(cell) < self.job.epsilon
+        return quadtree.lights(cell) == 1 or self.worst(cell) < PART[self.job.part] * self.job.epsilon
 
     def worst(self, cell: Cell) -> float:
         """Largest error of a cell's samples: of the nine, and where those are good enough, of all that are known."""
@@ -144,15 +141,15 @@ class ClusterWorker:
         """Error of every sample by the job's criterion."""
         if self.job.criterion == "paper":
             return measure.paper_errors(visible, directions, self.normal, self.reflectance)
-        return self.rms(cell, visible, directions)
+        return self.rms(cell, visible, directions, self.job.part)
 
-    def rms(self, cell: Cell, visible: NDArray[np.uint64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    def rms(
+        self, cell: Cell, visible: NDArray[np.uint64], directions: NDArray[np.float64], part: str
+    ) -> NDArray[np.float64]:
         """Error of every sample, and of even light, by area-weighted RMS."""
         radius = self.radius(cell)
         if self.lobes is not None:
-            if self.job.matte:
-                return self.lobes.matte_errors(visible, directions, radius)
-            return self.lobes.errors(visible, directions, radius)
+            return self.lobes.errors(visible, directions, radius, part)
         return np.sqrt(measure.visibility_errors(visible, directions, radius, self.normal, self.area))
 
     def radius(self, cell: Cell) -> float:
@@ -160,37 +157,40 @@ class ClusterWorker:
         return 0.5 * math.sqrt(float(quadtree.solid_angles(np.array([cell]), self.job.resolution)[0]))
 
     def fill(self, block: Block) -> Info:
-        """Writes the fractions of a range of the cells that have them, and without lobes the errors."""
+        """Writes the fractions and errors of a range of the cells that have them."""
         rows, cells = self.cells_of(block, DIFFUSE)
         fraction = np.zeros((len(cells), len(self.normal)), np.uint8)
+        error, paper = np.zeros(len(cells), np.float32), np.zeros(len(cells), np.float32)
+        part = "all" if self.lobes is None else "diffuse"
         for k, cell in enumerate(cells):
-            visible, directions = self.nine(cell) if self.job.criterion == "paper" else self.known(cell)
+            visible, directions = self.taken(cell)
             fraction[k] = measure.fractions(visible, directions, self.radius(cell), self.normal)
+            error[k] = self.rms(cell, visible, directions, part).max()
+            paper[k] = measure.paper_errors(*self.nine(cell), self.normal, self.reflectance).max()
         self.out("fraction")[rows] = fraction
-        if self.lobes is None:
-            self.put_errors(rows, cells)
+        self.out("error")[rows] = error
+        self.out("paper_error")[rows] = paper
         return {"clusters": len(cells)}
 
     def fill_lobes(self, block: Block) -> Info:
-        """Writes the lobes and the errors of a range of leaves."""
+        """Writes the lobes and errors of a range of the cells that have them."""
         assert self.lobes is not None
-        rows, cells = self.cells_of(block, "cell")
-        found = [
-            self.lobes.mean(*(self.nine(cell) if self.job.criterion == "paper" else self.known(cell))) for cell in cells
-        ]
-        self.out("lobe")[rows] = np.stack([lobe for lobe, _ in found])
-        self.out("lobe_scale")[rows] = np.stack([scale for _, scale in found])
-        self.put_errors(rows, cells)
+        rows, cells = self.cells_of(block, LOBE)
+        error, lobes, scales = np.zeros(len(cells), np.float32), [], []
+        for k, cell in enumerate(cells):
+            visible, directions = self.taken(cell)
+            lobe, scale = self.lobes.mean(visible, directions)
+            lobes.append(lobe)
+            scales.append(scale)
+            error[k] = self.rms(cell, visible, directions, "lobes").max()
+        self.out("lobe")[rows] = np.stack(lobes)
+        self.out("lobe_scale")[rows] = np.stack(scales)
+        self.out("lobe_error")[rows] = error
         return {"clusters": len(cells)}
 
-    def put_errors(self, rows: slice, cells: list[Cell]) -> None:
-        error, paper = np.zeros(len(cells), np.float32), np.zeros(len(cells), np.float32)
-        for k, cell in enumerate(cells):
-            visible, directions = self.nine(cell) if self.job.criterion == "paper" else self.known(cell)
-            error[k] = self.rms(cell, visible, directions).max()
-            paper[k] = measure.paper_errors(*self.nine(cell), self.normal, self.reflectance).max()
-        self.out("error")[rows] = error
-        self.out("paper_error")[rows] = paper
+    def taken(self, cell: Cell) -> tuple[NDArray[np.uint64], NDArray[np.float64]]:
+        """The samples that a cluster is made from."""
+        return self.nine(cell) if self.job.criterion == "paper" else self.known(cell)
 
     def cells_of(self, block: Block, name: str) -> tuple[slice, list[Cell]]:
         rows = slice(block.start, block.stop)
@@ -276,19 +276,19 @@ class _Lobes:
         w = self.worker
         return measure.lobe_transfer(visible, directions, w.normal, self.view, rows, self.material, self.table)
 
-    def matte_errors(
-        self, visible: NDArray[np.uint64], directions: NDArray[np.float64], radius: float
-    ) -> NDArray[np.float64]:
-        """Error of diffuse light alone, relative to the same reference."""
-        w = self.worker
-        area = w.area * self.diffuse**2
-        return np.sqrt(measure.visibility_errors(visible, directions, radius, w.normal, area))
-
     def errors(
-        self, visible: NDArray[np.uint64], directions: NDArray[np.float64], radius: float
+        self, visible: NDArray[np.uint64], directions: NDArray[np.float64], radius: float, part: str
     ) -> NDArray[np.float64]:
+        """Error of every sample, of all light or of a part of it."""
         w = self.worker
-        square = measure.visibility_errors(visible, directions, radius, w.normal, self.matte)
+        if part == "diffuse":
+            every = w.area * self.diffuse**2
+            return np.sqrt(measure.visibility_errors(visible, directions, radius, w.normal, every))
+        diffuse, square = self.diffuse, np.zeros(len(visible) + 1)
+        if part == "lobes":
+            diffuse = np.zeros_like(diffuse)
+        else:
+            square = measure.visibility_errors(visible, directions, radius, w.normal, self.matte)
         given = measure.add_glossy_errors(
             square,
             visible,
@@ -297,7 +297,7 @@ class _Lobes:
             w.normal,
             self.judged,
             self.transfer(visible, directions, self.judged),
-            self.diffuse,
+            diffuse,
             self.specular,
             self.area,
         )

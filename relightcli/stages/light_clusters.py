@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from relightcli.core.transport.receivers import receiver_areas
 from relightcli.errors import InputError, StoreError
 from relightcli.run import blocks as run
 from relightcli.stages.cluster import copy_arrays
-from relightcli.stages.light_cluster_job import DIFFUSE, SCRATCH, ClusterJob, ClusterWorker, as_cell
+from relightcli.stages.light_cluster_job import DIFFUSE, LOBE, SCRATCH, ClusterJob, ClusterWorker, as_cell
 from relightcli.stages.lighting import SHINY, LightingStore, need_still
 from relightcli.stages.outputs import resolve_camera
 
@@ -118,11 +119,16 @@ def cluster_lights(config: Config) -> dict[str, Any]:
         job = ClusterJob(
             str(writer.partial_path), config.resolution, epsilon, config.criterion, shadows, view is not None
         )
-        if config.lights is None and config.seconds is None:
-            leaves = _refine(job, writer, config, "")
+        budget = config.lights is not None or config.seconds is not None
+        parts = (DIFFUSE, LOBE) if view is not None else (DIFFUSE,)
+        if view is not None and config.criterion == "rms" and not budget:
+            found = [_refine(replace(job, part=p), writer, config, f"{p}-") for p in ("diffuse", "lobes")]
+            leaves = quadtree.overlay(found[0], found[1], config.resolution)
+            trees = [_in_order(cells, config.resolution) for cells in found]
         else:
-            leaves = _spend(job, writer, config)
-        leaves = _in_order(leaves, config.resolution)
+            leaves = _spend(job, writer, config) if budget else _refine(job, writer, config, "")
+            leaves = _in_order(leaves, config.resolution)
+            trees = [leaves] * len(parts)
         cells = np.array(leaves, np.int32)
         writer.put("light_clusters/cell", cells, dims=("cluster", CELL))
         writer.put(
@@ -131,22 +137,16 @@ def cluster_lights(config: Config) -> dict[str, Any]:
             dims=("cluster",),
             units="sr",
         )
-        diffuse = leaves
-        if view is not None and config.criterion == "rms":
-            diffuse = _in_order(_refine(replace(job, matte=True), writer, config, "matte-"), config.resolution)
-        writer.put(f"light_clusters/{DIFFUSE}", np.array(diffuse, np.int32), dims=("diffuse_cluster", CELL))
+        for part, tree in zip(parts, trees, strict=True):
+            writer.put(f"light_clusters/{part}", np.array(tree, np.int32), dims=(part, CELL))
         lobed = _lobe_count(writer) if view is not None else 0
-        _create_outputs(writer, len(leaves), len(diffuse), len(lighting), lobed)
-        run.run_blocks(
-            job,
-            run.split("fraction", len(diffuse), CLUSTERS) + (run.split("lobe", len(leaves), CLUSTERS) if lobed else []),
-            writer,
-            workers=config.workers,
-            label="clusters",
-            quiet=config.quiet,
-        )
+        _create_outputs(writer, [len(tree) for tree in trees], len(lighting), lobed)
+        blocks = []
+        for name, tree in zip(("fraction", "lobe"), trees, strict=False):
+            blocks += run.split(name, len(tree), CLUSTERS)
+        run.run_blocks(job, blocks, writer, workers=config.workers, label="clusters", quiet=config.quiet)
         if "check" not in writer.done:
-            writer.record("check", job.open().check(diffuse, config.seed))
+            writer.record("check", job.open().check(trees[0], config.seed))
         run.close_worker()
         del base
         writer.commit({"seconds": time.perf_counter() - started, "resumed": resumed, "workers": config.workers})
@@ -225,13 +225,13 @@ def _lobe_count(writer: formats.Writer) -> int:
     return int(formats.worker_array(writer.partial_path, "light_clusters/lobed").shape[0])
 
 
-def _create_outputs(writer: formats.Writer, clusters: int, diffuse: int, receivers: int, lobed: int) -> None:
+def _create_outputs(writer: formats.Writer, parts: list[int], receivers: int, lobed: int) -> None:
     def array(
-        name: str, dtype: Any, shape: tuple[int, ...], dims: tuple[str, ...], text: str, units: str | None = None
+        name: str, dtype: Any, shape: Sequence[int], dims: tuple[str, ...], text: str, units: str | None = None
     ) -> None:
         writer.array(
             f"light_clusters/{name}",
-            shape=shape,
+            shape=tuple(shape),
             dtype=dtype,
             chunks=(CLUSTERS, *(min(n, RECEIVERS) for n in shape[1:])),
             dims=dims,
@@ -241,16 +241,17 @@ def _create_outputs(writer: formats.Writer, clusters: int, diffuse: int, receive
         )
 
     visible = "visible part of the cluster, in steps of 1/255"
-    array("fraction", np.uint8, (diffuse, receivers), ("diffuse_cluster", "receiver"), visible)
-    one = ((clusters,), ("cluster",))
-    array("error", np.float32, *one, "largest of the samples' errors by area-weighted RMS, 1 is a light overhead")
-    array("paper_error", np.float32, *one, "largest of the samples' errors as in Johan and Nishita, Eq. 11")
+    array("fraction", np.uint8, (parts[0], receivers), (DIFFUSE, "receiver"), visible)
+    rms = "largest of the samples' errors by area-weighted RMS, 1 is a light overhead"
+    array("error", np.float32, parts[:1], (DIFFUSE,), rms)
+    array("paper_error", np.float32, parts[:1], (DIFFUSE,), "the same as in Johan and Nishita, Eq. 11")
     if lobed:
         groups = -(-lobed // GROUP)
+        array("lobe_error", np.float32, parts[1:], (LOBE,), rms)
         steps = "transfer by the specular lobe, in steps of the group's scale"
-        array("lobe", np.uint8, (clusters, lobed), ("cluster", "lobed"), steps)
+        array("lobe", np.uint8, (parts[1], lobed), (LOBE, "lobed"), steps)
         scale = "a step of `lobe` for 64 receivers"
-        array("lobe_scale", np.float32, (clusters, groups), ("cluster", "lobed_group"), scale, "sr-1")
+        array("lobe_scale", np.float32, (parts[1], groups), (LOBE, "lobed_group"), scale, "sr-1")
 
 
 def _refine(job: ClusterJob, writer: formats.Writer, config: Config, prefix: str) -> list[Cell]:

@@ -15,7 +15,7 @@ from relightcli.core.measure.errors import relative_rmse
 from relightcli.errors import InputError, StoreError
 from relightcli.scene.model import Camera, Material
 from relightcli.stages import light_cluster_job
-from relightcli.stages.clustered import ClusteredStore
+from relightcli.stages.clustered import ClusteredStore, Runs
 from relightcli.stages.light_clusters import Config, cluster_lights
 from relightcli.stages.lighting import LightingStore
 from relightcli.stages.relight import Config as RelightConfig
@@ -400,14 +400,13 @@ def test_specular_lobes_of_a_fixed_view(glossy):
         picture(store, "c.exr", camera="other")
     with pytest.raises(InputError, match="ball: another specular lobe than the clusters were made for"):
         picture(store, "c.exr", settings=("ball.roughness=0.5",))
-    # Diffuse light has larger cells, each of them a run of the lobes' clusters.
-    opened = formats.open_store(store)
-    cells, larger = opened.read("light_clusters/cell"), opened.read("light_clusters/diffuse_cell")
-    assert len(larger) < 0.7 * len(cells)
-    assert opened.layouts["light_clusters/fraction"].shape[0] == len(larger)
-    sky = ClusteredStore(store, 1).sky
-    solid = np.add.reduceat(opened.read("light_clusters/solid_angle"), sky.first)
-    np.testing.assert_allclose(solid, quadtree.solid_angles(larger, 64), rtol=1e-12)
+    # Diffuse light and lobes have cells of their own, runs of clusters.
+    opened, tree = formats.open_store(store), ClusteredStore(store, 1).sky.tree
+    solid = opened.read("light_clusters/solid_angle")
+    for part, values in (("diffuse_cell", "fraction"), ("lobe_cell", "lobe")):
+        own = opened.read(f"light_clusters/{part}")
+        assert len(own) == opened.layouts[f"light_clusters/{values}"].shape[0] < 0.9 * len(tree.cell)
+        np.testing.assert_allclose(Runs(tree, own).sum(solid), quadtree.solid_angles(own, 64), rtol=1e-12)
 
 
 def test_without_a_fixed_view_every_view_and_lobe_will_do(glossy):

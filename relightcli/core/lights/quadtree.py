@@ -59,6 +59,20 @@ def children(cell: Cell) -> list[Cell]:
     return [part for part in parts if lights(part)]
 
 
+def overlay(one: Iterable[Cell], other: Iterable[Cell], resolution: int) -> list[Cell]:
+    """The leaves of the largest tree of which both trees' leaves are nodes or runs of leaves, in the trees' order."""
+    trees, out = (set(one), set(other)), []
+    stack = [(cell, False, False) for cell in roots(resolution)[::-1]]
+    while stack:
+        cell, *reached = stack.pop()
+        a, b = (done or cell in tree for done, tree in zip(reached, trees, strict=True))
+        if a and b:
+            out.append(cell)
+        else:
+            stack += [(part, a, b) for part in children(cell)[::-1]]
+    return out
+
+
 def samples(cell: Cell, resolution: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Flat texel index (S,) of up to nine lights of a cell, and their directions (S, 3).
 

@@ -10,20 +10,34 @@ sky of 1e-3.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.lights.leaf_light import LeafLight
+from relightcli.core.shade.gather import in_parts
 
 GROUP = 64
 FEW = 16  # clusters that one thread changes sooner than several start
 NONE, ALL = -1, -2
+ALIKE = 1e-3  # how far a colour's mean direction may be from that of all for one cosine to do
+
+
+class _Flat(NamedTuple):
+    """Light of some clusters as kernels read it.
+
+    light (k, 3, 5): per colour the moment, r F, and 1 / (4 r F), 0 where there is no light; alike (k,): whether mean
+    (k, 3), the moment over the flux of all colours, does for each; flux (k, 3); radius (k,).
+    """
+
+    light: NDArray[np.float64]
+    alike: NDArray[np.bool_]
+    mean: NDArray[np.float64]
+    flux: NDArray[np.float64]
+    radius: NDArray[np.float64]
 
 
 class Fractions:
@@ -56,19 +70,24 @@ class Fractions:
     def sum(self, light: LeafLight, threads: int) -> NDArray[np.float64]:
         """Irradiance by groups, (G, 3, 64) float64."""
         out = np.zeros((len(self.place), 3, GROUP))
-        flat = self._flat(light, slice(None))
-        _in_parts(
-            lambda a, b: _sum_all(self.place[a:b], self.mixed, self.normal[a:b], flat, out[a:b]), len(out), threads
-        )
+        every = np.arange(len(light.flux))
+        self._add(out, every, self._flat(light, every), threads)
         return out
 
     def change(
         self, out: NDArray[np.float64], clusters: NDArray[np.int64], old: LeafLight, new: LeafLight, threads: int
     ) -> None:
-        """Adds to irradiance (G, 3, 64) what it gains when the light of some clusters (k,) goes from old to new."""
-        before, after = self._flat(old, clusters), self._flat(new, clusters)
-        _in_parts(
-            lambda a, b: _change(self.place[a:b], self.mixed, self.normal[a:b], clusters, before, after, out[a:b]),
+        """Adds to irradiance (G, 3, 64) what it gains when the light of some clusters (k,) goes from old to new.
+
+        old, new: of these clusters alone.
+        """
+        twice = np.concatenate([clusters, clusters])
+        light = LeafLight(np.concatenate([-old.flux, new.flux]), np.concatenate([-old.moment, new.moment]))
+        self._add(out, twice, self._flat(light, twice), threads)
+
+    def _add(self, out: NDArray[np.float64], clusters: NDArray[np.int64], light: _Flat, threads: int) -> None:
+        in_parts(
+            lambda a, b: _add_all(self.place[a:b], self.mixed, self.normal[a:b], clusters, *light, out[a:b]),
             len(out),
             threads if len(clusters) > FEW else 1,
         )
@@ -83,11 +102,15 @@ class Fractions:
         padded[: self.count] = values
         return np.ascontiguousarray(padded.reshape(-1, GROUP, 3).transpose(0, 2, 1))
 
-    def _flat(self, light: LeafLight, chosen: Any) -> NDArray[np.float64]:
-        """Per cluster and colour: moment, r F, and 1 / (4 r F), 0 where there is no light: (k, 3, 5)."""
-        reach = light.flux[chosen] * self.radius[chosen][:, None]
-        steep = np.divide(0.25, reach, out=np.zeros_like(reach), where=reach > 0.0)
-        return np.concatenate([light.moment[chosen], reach[..., None], steep[..., None]], axis=2)
+    def _flat(self, light: LeafLight, chosen: NDArray[np.int64]) -> _Flat:
+        flux, moment, radius = *light, self.radius[chosen]
+        reach = flux * radius[:, None]
+        steep = np.divide(0.25, reach, out=np.zeros_like(reach), where=reach != 0.0)
+        total = flux.sum(axis=1)[:, None]
+        mean = np.divide(moment.sum(axis=1), total, out=np.zeros((len(chosen), 3)), where=total != 0.0)
+        apart = np.abs(moment - flux[:, :, None] * mean[:, None, :]).max(axis=2)
+        alike = (apart <= ALIKE * np.abs(flux)).all(axis=1) & (radius > 0.0)
+        return _Flat(np.concatenate([moment, reach[..., None], steep[..., None]], axis=2), alike, mean, flux, radius)
 
     def of(self, cluster: int) -> NDArray[np.uint8]:
         """One cluster's fractions, (N,), in steps of 1/255."""
@@ -96,16 +119,6 @@ class Fractions:
         out[place == ALL] = 255
         out[place >= 0] = self.mixed[place[place >= 0]]
         return out.reshape(-1)[: self.count]
-
-
-def _in_parts(work, count: int, threads: int) -> None:  # type: ignore[no-untyped-def]
-    if threads <= 1:
-        work(0, count)
-        return
-    cuts = np.unique(np.linspace(0, count, 4 * threads + 1).astype(int))
-    with ThreadPoolExecutor(threads) as pool:
-        for job in [pool.submit(work, a, b) for a, b in itertools.pairwise(cuts)]:
-            job.result()
 
 
 def _pack(column: NDArray[np.uint8], first: int, whole: bool = True) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
@@ -153,58 +166,55 @@ def _keep(column, place, mixed, first):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def _spread(height, reach, steep):  # type: ignore[no-untyped-def]
-    """F g of a moment's height n . m, with r F and 1 / (4 r F)."""
-    low = max(height + reach, 0.0)
-    return height if height >= reach else low * low * steep
+    """F g of a moment's height n . m, with r F and 1 / (4 r F); of light that is taken away, F < 0, as well."""
+    side = 1.0 if reach >= 0.0 else -1.0
+    low = max(side * (height + reach), 0.0)
+    return height if side * (height - reach) >= 0.0 else low * low * steep
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def _sum_all(place, mixed, normal, light, out):  # type: ignore[no-untyped-def]
-    whole = np.empty((3, 3))
+def _add_all(place, mixed, normal, clusters, light, alike, mean, flux, radius, out):  # type: ignore[no-untyped-def]
+    whole, sums = np.empty((3, 3)), np.empty((3, GROUP))
     for g in range(len(place)):
+        nothing = True
+        for j in range(len(clusters)):
+            nothing &= place[g, clusters[j]] == NONE
+        if nothing:
+            continue
         whole[:] = 0.0
+        sums[:] = 0.0
         x, y, z = normal[g, 0], normal[g, 1], normal[g, 2]
-        for k in range(place.shape[1]):
-            p = place[g, k]
+        red, green, blue = sums[0], sums[1], sums[2]
+        for j in range(len(clusters)):
+            p = place[g, clusters[j]]
             if p == NONE:
                 continue
+            if p == ALL:
+                for c in range(3):
+                    for k in range(3):
+                        whole[c, k] += light[j, c, k]
+                continue
+            row = mixed[p]
+            if alike[j]:
+                a, b, d, r, steep = mean[j, 0], mean[j, 1], mean[j, 2], radius[j], 0.25 / radius[j]
+                fr, fg, fb = flux[j, 0], flux[j, 1], flux[j, 2]
+                for i in range(GROUP):
+                    h = x[i] * a + y[i] * b + z[i] * d
+                    low = max(h + r, 0.0)
+                    seen = np.float64(row[i]) * (h if h >= r else low * low * steep)
+                    red[i] += fr * seen
+                    green[i] += fg * seen
+                    blue[i] += fb * seen
+                continue
             for c in range(3):
-                a, b, d, reach, steep = light[k, c, 0], light[k, c, 1], light[k, c, 2], light[k, c, 3], light[k, c, 4]
-                if p == ALL:
-                    whole[c, 0] += a
-                    whole[c, 1] += b
-                    whole[c, 2] += d
-                    continue
-                row, into = mixed[p], out[g, c]
+                a, b, d, reach, steep = light[j, c, 0], light[j, c, 1], light[j, c, 2], light[j, c, 3], light[j, c, 4]
+                into = sums[c]
                 for i in range(GROUP):
                     into[i] += np.float64(row[i]) * _spread(x[i] * a + y[i] * b + z[i] * d, reach, steep)
         for c in range(3):
             into = out[g, c]
             for i in range(GROUP):
-                into[i] = into[i] / 255.0 + x[i] * whole[c, 0] + y[i] * whole[c, 1] + z[i] * whole[c, 2]
-
-
-@njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
-def _change(place, mixed, normal, clusters, old, new, out):  # type: ignore[no-untyped-def]
-    for g in range(len(place)):
-        x, y, z = normal[g, 0], normal[g, 1], normal[g, 2]
-        for j in range(len(clusters)):
-            p = place[g, clusters[j]]
-            if p == NONE:
-                continue
-            for c in range(3):
-                a, b, d, reach, steep = old[j, c, 0], old[j, c, 1], old[j, c, 2], old[j, c, 3], old[j, c, 4]
-                e, f, h, now, sharp = new[j, c, 0], new[j, c, 1], new[j, c, 2], new[j, c, 3], new[j, c, 4]
-                into = out[g, c]
-                if p == ALL:
-                    for i in range(GROUP):
-                        into[i] += x[i] * (e - a) + y[i] * (f - b) + z[i] * (h - d)
-                else:
-                    row = mixed[p]
-                    for i in range(GROUP):
-                        before = _spread(x[i] * a + y[i] * b + z[i] * d, reach, steep)
-                        after = _spread(x[i] * e + y[i] * f + z[i] * h, now, sharp)
-                        into[i] += np.float64(row[i]) / 255.0 * (after - before)
+                into[i] += sums[c, i] / 255.0 + (x[i] * whole[c, 0] + y[i] * whole[c, 1] + z[i] * whole[c, 2])
 
 
 class Lobes:
@@ -219,27 +229,70 @@ class Lobes:
         group, cluster = np.nonzero(self.place >= 0)
         self.scale[self.place[group, cluster]] = scale[cluster, group]
 
-    def sum(self, clusters: NDArray[np.int64], flux: NDArray[np.float64], threads: int) -> NDArray[np.float64]:
-        """Specular light (n, 3) float64 of some clusters with flux (k, 3), without the specular colour."""
-        out = np.zeros((len(self.place), 3, GROUP))
-        _in_parts(
+    def dark(self) -> NDArray[np.float64]:
+        """Specular light by groups (G, 3, 64) float64, of no light yet."""
+        return np.zeros((len(self.place), 3, GROUP))
+
+    def add(
+        self, out: NDArray[np.float64], clusters: NDArray[np.int64], flux: NDArray[np.float64], threads: int
+    ) -> None:
+        """Adds to specular light (G, 3, 64), without the specular colour, that of some clusters with flux (k, 3)."""
+        in_parts(
             lambda a, b: _sum_lobes(self.place[a:b], self.mixed, self.scale, clusters, flux, out[a:b]),
             len(out),
-            threads,
+            threads if len(clusters) > FEW else 1,
         )
-        return np.ascontiguousarray(out.transpose(0, 2, 1)).reshape(-1, 3)[: self.count]
+
+    def put(
+        self, groups: NDArray[np.float64], more: NDArray[np.float64] | None, rows: NDArray[np.int64], count: int
+    ) -> NDArray[np.float32]:
+        """Specular light by groups (G, 3, 64) plus `more` (n, 3), at the `rows` (n,) of (count, 3); not below 0."""
+        out = np.zeros((count, 3), np.float32)
+        _put(groups, np.zeros((0, 3)) if more is None else more, rows, out)
+        return out
+
+
+@njit(cache=True, nogil=True)
+def _put(groups, more, rows, out):  # type: ignore[no-untyped-def]
+    for j in range(len(rows)):
+        for c in range(3):
+            value = groups[j // GROUP, c, j % GROUP]
+            if len(more):
+                value += more[j, c]
+            out[rows[j], c] = np.float32(max(value, 0.0))
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def _sum_lobes(place, mixed, scale, clusters, flux, out):  # type: ignore[no-untyped-def]
+    rows, weight = np.empty(4, np.int64), np.empty((4, 3))
     for g in range(len(place)):
+        red, green, blue = out[g, 0], out[g, 1], out[g, 2]
+        held = 0
         for j in range(len(clusters)):
             p = place[g, clusters[j]]
             if p < 0:
                 continue
-            row = mixed[p]
-            for c in range(3):
-                step = np.float64(scale[p]) * flux[j, c]
-                into = out[g, c]
-                for i in range(GROUP):
-                    into[i] += np.float64(row[i]) * step
+            step = np.float64(scale[p])
+            rows[held] = p
+            weight[held, 0], weight[held, 1], weight[held, 2] = step * flux[j, 0], step * flux[j, 1], step * flux[j, 2]
+            held += 1
+            if held < 4:  # four at a time: fewer passes over the sums
+                continue
+            held = 0
+            a, b, c, d = mixed[rows[0]], mixed[rows[1]], mixed[rows[2]], mixed[rows[3]]
+            a0, a1, a2 = weight[0]
+            b0, b1, b2 = weight[1]
+            c0, c1, c2 = weight[2]
+            d0, d1, d2 = weight[3]
+            for i in range(GROUP):
+                x, y, z, w = np.float64(a[i]), np.float64(b[i]), np.float64(c[i]), np.float64(d[i])
+                red[i] += (x * a0 + y * b0) + (z * c0 + w * d0)
+                green[i] += (x * a1 + y * b1) + (z * c1 + w * d1)
+                blue[i] += (x * a2 + y * b2) + (z * c2 + w * d2)
+        for k in range(held):
+            row = mixed[rows[k]]
+            x, y, z = weight[k]
+            for i in range(GROUP):
+                red[i] += np.float64(row[i]) * x
+                green[i] += np.float64(row[i]) * y
+                blue[i] += np.float64(row[i]) * z

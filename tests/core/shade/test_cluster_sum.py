@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from relightcli.core.lights.leaf_light import LeafLight
-from relightcli.core.shade.cluster_sum import ALL, NONE, Fractions, Lobes
+from relightcli.core.shade.cluster_sum import ALIKE, ALL, NONE, Fractions, Lobes
 from tests.core.brdf.reflectances import random_directions
 
 M, N = 30, 300
@@ -55,6 +55,10 @@ def test_sum(threads):
         np.testing.assert_array_equal(packed.of(k), steps[k])
 
 
+def of(light, clusters):
+    return LeafLight(light.flux[clusters], light.moment[clusters])
+
+
 def test_change_is_the_difference_of_two_sums():
     steps, normal, radius, old = make()
     packed = Fractions(columns(steps), normal, radius)
@@ -65,8 +69,21 @@ def test_change_is_the_difference_of_two_sums():
     expected = packed.sum(new, 1)
     for threads in (1, 2):
         found = packed.sum(old, 1)
-        packed.change(found, chosen, old, new, threads)
+        packed.change(found, chosen, of(old, chosen), of(new, chosen), threads)
         np.testing.assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max())
+
+
+def test_colours_from_one_place_share_their_cosine():
+    steps, normal, radius, light = make()
+    packed = Fractions(columns(steps), normal, radius)
+    apart = light.flux[:, :, None] * np.array([[0.5, 0.5, 0.1], [-0.5, -0.5, 0.1], [0.0, 0.0, -0.4]])
+    for size in (0.0, 0.8e-3, 3e-3):  # shared by all, by some, and taken colour by colour
+        other = LeafLight(light.flux, light.moment + size * apart)
+        alike = packed._flat(other, np.arange(M)).alike
+        assert alike.all() if size < 1e-3 else not alike[light.flux[:, 0] > 0].any()
+        error = np.abs(packed.by_receiver(packed.sum(other, 1)) - dense(steps, normal, radius, other))
+        limit = ALIKE * light.flux.sum(axis=0) if 0.0 < size < 1e-3 else 1e-12 * light.flux.sum(axis=0)
+        assert (error <= limit).all()
 
 
 def test_a_sun_that_comes_and_goes_leaves_the_digits_of_a_faint_sky():
@@ -79,10 +96,16 @@ def test_a_sun_that_comes_and_goes_leaves_the_digits_of_a_faint_sky():
     at = np.array([7])
     before = packed.sum(faint, 1)
     after = before.copy()
-    packed.change(after, at, faint, sunny, 1)
+    packed.change(after, at, of(faint, at), of(sunny, at), 1)
     assert after.max() > 1e5
-    packed.change(after, at, sunny, faint, 1)
+    packed.change(after, at, of(sunny, at), of(faint, at), 1)
     np.testing.assert_allclose(after, before, rtol=1e-6, atol=1e-9 * before.max())
+
+
+def shine(lobes, clusters, flux, threads):
+    groups = lobes.dark()
+    lobes.add(groups, clusters, flux, threads)
+    return np.ascontiguousarray(groups.transpose(0, 2, 1)).reshape(-1, 3)[: lobes.count]
 
 
 def test_lobes():
@@ -92,9 +115,18 @@ def test_lobes():
     steps[5:10, 64:128] = 0
     scale = rng.random((M, -(-N // 64))).astype(np.float32)
     chosen, flux = np.arange(2, M, 3), rng.random((10, 3))[: len(np.arange(2, M, 3))]
-    found = Lobes(steps, scale).sum(chosen, flux, 2)
+    lobes = Lobes(steps, scale)
+    found = shine(lobes, chosen, flux, 2)
     expected = np.einsum("kn,kc->nc", (steps * np.repeat(scale.astype(np.float64), 64, axis=1)[:, :N])[chosen], flux)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
+    rows, more = np.sort(rng.permutation(2 * N)[:N]), -2.0 * expected * (rng.random((N, 3)) < 0.5)
+    groups = lobes.dark()
+    lobes.add(groups, chosen, flux, 1)
+    placed = np.zeros((2 * N, 3))
+    placed[rows] = np.maximum(expected + more, 0.0)
+    np.testing.assert_allclose(lobes.put(groups, more, rows, 2 * N), placed, rtol=1e-6, atol=1e-9 * placed.max())
+    placed[rows] = expected
+    np.testing.assert_allclose(lobes.put(groups, None, rows, 2 * N), placed, rtol=1e-6)
 
 
 @pytest.mark.parametrize("count", [1, 63, 64, 65, 300])
@@ -127,8 +159,8 @@ def test_threads_change_the_same_bits(chosen):
     new = LeafLight(old.flux * 1.7, old.moment * 1.7)
     one, three = packed.sum(old, 1), packed.sum(old, 3)
     np.testing.assert_array_equal(one, three)
-    packed.change(one, chosen, old, new, 1)
-    packed.change(three, chosen, old, new, 3)
+    packed.change(one, chosen, of(old, chosen), of(new, chosen), 1)
+    packed.change(three, chosen, of(old, chosen), of(new, chosen), 3)
     np.testing.assert_array_equal(one, three)
     picked = LeafLight(np.zeros_like(old.flux), np.zeros_like(old.moment))
     picked.flux[chosen], picked.moment[chosen] = 0.7 * old.flux[chosen], 0.7 * old.moment[chosen]
@@ -143,9 +175,9 @@ def test_a_cluster_may_lose_all_its_light_and_get_it_back():
     every = np.arange(M)
     out = packed.sum(light, 1)
     scale = out.max()
-    packed.change(out, every, light, dark, 1)
+    packed.change(out, every, of(light, every), of(dark, every), 1)
     np.testing.assert_allclose(out, 0, atol=1e-12 * scale)
-    packed.change(out, every, dark, light, 1)
+    packed.change(out, every, of(dark, every), of(light, every), 1)
     np.testing.assert_allclose(out, packed.sum(light, 1), atol=1e-12 * scale)
     assert not packed.sum(dark, 1).any()
 
@@ -162,8 +194,8 @@ def test_what_a_sun_leaves_behind_is_its_last_digit():
     after = before.copy()
     at = np.array([7, 25])
     for _ in range(10):
-        packed.change(after, at, faint, sunny, 1)
-        packed.change(after, at, sunny, faint, 1)
+        packed.change(after, at, of(faint, at), of(sunny, at), 1)
+        packed.change(after, at, of(sunny, at), of(faint, at), 1)
     assert np.abs(after - before).max() < 20 * np.spacing(2e6)
 
 
@@ -183,6 +215,6 @@ def test_lobes_of_full_empty_and_unscaled_groups():
     flux = rng.random((M, 3)) * 10.0 ** rng.uniform(-3, 3, (M, 1))
     for chosen in (np.arange(M), np.array([29, 0, 7, 17]), np.arange(5, 10), np.zeros(0, np.int64)):
         expected = np.einsum("kn,kc->nc", transfer[chosen], flux[chosen])
-        found = lobes.sum(chosen, flux[chosen], 1)
+        found = shine(lobes, chosen, flux[chosen], 1)
         np.testing.assert_allclose(found, expected, rtol=1e-12)
-        np.testing.assert_array_equal(lobes.sum(chosen, flux[chosen], 3), found)
+        np.testing.assert_array_equal(shine(lobes, chosen, flux[chosen], 3), found)
