@@ -205,7 +205,10 @@ class _Tensors:
         self.second: Factors | None = None
         if asset.bounces > 1:
             self.rows.append(_factors(asset.store, "two_bounce/receiver_factor")[self.cluster, place])
-            self.second = _factors(asset.store, "two_bounce/core")
+            core = _factors(asset.store, "two_bounce/core")
+            lights = asset.store.layouts["two_bounce/keep"].shape[0] + asset.lamps
+            parts = core.reshape(*core.shape[:2], -1, lights, self.q)  # light last, for a plain product with it
+            self.second = np.ascontiguousarray(parts.swapaxes(3, 4))
         material = asset.geometry.material[asset.object]
         may_shine = np.isin(asset.made_for, list(LOBED))[material[receiver]]
         self.lobed = receiver[may_shine]
@@ -236,7 +239,8 @@ class _Tensors:
             return
         self._sky, self._weights = sky, None
         lamps = np.eye(3, dtype=np.float32)[: self.asset.lamps]
-        incident = irradiance(self._fit_bits, self._fit_normal, moment_prefix(spread)) / np.float32(np.pi)
+        prefix, threads = moment_prefix(spread), self.asset.threads
+        incident = irradiance(self._fit_bits, self._fit_normal, prefix, threads) / np.float32(np.pi)
 
         def matched(bounce: int, mean: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
             fit, keep = self._fit[bounce]
@@ -244,12 +248,16 @@ class _Tensors:
 
         light = matched(0, self.basis.T @ cell_radiance(sky.flux, sky.resolution, CELLS))
         reduced = np.matmul(light.T, self.light_factor)  # (C, 3, light eigenvectors)
-        one = np.matmul(reduced, self.core)
+        one = np.empty((len(reduced), 3, self.core.shape[2]), np.float32)
+
+        def contract(a: int, b: int) -> None:
+            np.matmul(reduced[a:b], self.core[a:b], out=one[a:b])
+
+        in_parts(contract, len(one), threads)
         self._one = one.reshape(len(one), 3, -1, self.q, self.asset.order**2)
         if self.second is not None:
             light = matched(1, cell_radiance(sky.flux, sky.resolution, COARSE))
-            parts = self.second.reshape(*self.second.shape[:2], -1, len(light), self.q)
-            self._two = np.einsum("crxlq,lk->crxqk", parts, light, optimize=True)
+            self._two = self.second @ light
 
     def set_materials(self, weights: NDArray[np.float64]) -> None:
         """weights (Q, 3) of the channels."""
@@ -332,15 +340,28 @@ def _spread(first, last, rows, cluster, flat, even_weights, even, lobe_row, rota
             even[i, colour] = max(total, zero)
             if row >= 0:
                 target = local[row, colour]
-                target[:] = zero
                 if count == 1:
                     target[0] = max(total, zero)
+                    continue
+                if count == 16:  # four bands, their loops unrolled
+                    _turn(rotations[row], 0, light, 0, target, 1)
+                    _turn(rotations[row], 1, light, 1, target, 3)
+                    _turn(rotations[row], 10, light, 4, target, 5)
+                    _turn(rotations[row], 35, light, 9, target, 7)
                     continue
                 at = low = band = 0
                 while low < count:
                     n = 2 * band + 1  # harmonics of the band
-                    for k in range(n):
-                        for j in range(n):
-                            target[low + j] += rotations[row, at + k * n + j] * light[low + k]
+                    _turn(rotations[row], at, light, low, target, n)
                     at += n * n
                     low, band = low + n, band + 1
+
+
+@njit(cache=True, nogil=True, inline="always", fastmath={"reassoc", "contract", "nsz"})
+def _turn(rotation, at, light, low, target, n):  # type: ignore[no-untyped-def]
+    """A band of n harmonics, from `low` on, turned by the matrix from `at` on, column after column."""
+    for j in range(n):
+        total = np.float32(0.0)
+        for k in range(n):
+            total += rotation[at + k * n + j] * light[low + k]
+        target[low + j] = total

@@ -40,10 +40,17 @@ def prefiltered_sky(
 
     degrees: of the lobes, as in `SpecularLobes`; mirror: the sky of the 0 degree lobe, `sky` if not given.
     """
-    return tuple(
-        _gaussian(sky, degree, threads) if degree > 0.0 else _corners(sky if mirror is None else mirror)
-        for degree in degrees
-    )
+    lights: dict[int, NDArray[np.float32]] = {}  # by the resolution that lobes take light from
+    found = []
+    for degree in degrees:
+        if degree == 0.0:
+            found.append(_corners(sky if mirror is None else mirror))
+            continue
+        plan = _plan(sky.resolution, degree, threads)
+        if plan.source not in lights:
+            lights[plan.source] = _light(sky, plan.source)
+        found.append(_gaussian(plan, lights[plan.source], threads))
+    return tuple(found)
 
 
 def _corners(sky: SkyCube) -> NDArray[np.float32]:
@@ -80,23 +87,30 @@ class _Plan(NamedTuple):
     narrow: float
 
 
-def _gaussian(sky: SkyCube, degrees: float, threads: int) -> NDArray[np.float32]:
-    plan = _plan(sky.resolution, degrees, threads)
-    source, shrink = plan.source, sky.resolution // plan.source
-    flux = cube.block_sums(sky.flux, sky.resolution, shrink)
-    moment = cube.block_sums(sky.moment.sum(axis=1), sky.resolution, shrink)
-    length = np.sqrt((moment**2).sum(1, keepdims=True))
-    center = cube.texel_directions(source).reshape(-1, 3)
-    away = np.where(length > 0.0, moment / np.where(length > 0.0, length, 1.0) - center, 0.0)
-    light = _by_tile(np.concatenate([flux, away / plan.narrow**2], axis=1), source)
+def _gaussian(plan: _Plan, light: NDArray[np.float32], threads: int) -> NDArray[np.float32]:
     out = np.zeros((len(plan.node), 4), np.float32)
+    steep = np.float32(1.0 / plan.narrow**2)
     in_parts(
-        lambda a, b: _convolve(plan.node[a:b], plan.start[a : b + 1], plan.tile, plan.weight, light, out[a:b]),
+        lambda a, b: _convolve(plan.node[a:b], plan.start[a : b + 1], plan.tile, plan.weight, light, steep, out[a:b]),
         len(plan.node),
         threads,
     )
     n = math.isqrt(len(plan.node) // 6)
     return out.reshape(6, n, n, 4)
+
+
+def _light(sky: SkyCube, source: int) -> NDArray[np.float32]:
+    """Flux of texels that are source to a face's side, and the way from their centre to their light's mean direction:
+    (tiles, 6, T)."""
+    tile = min(_TILE, source)
+    out = np.empty((6 * (source // tile) ** 2, 6, tile * tile), np.float32)
+    _sum_texels(sky.flux, sky.moment, source, sky.resolution // source, tile, _centers(source), out)
+    return out
+
+
+@lru_cache(maxsize=8)
+def _centers(source: int) -> NDArray[np.float64]:
+    return np.ascontiguousarray(cube.texel_directions(source).reshape(-1, 3), np.float64)
 
 
 @lru_cache(maxsize=8)
@@ -144,6 +158,28 @@ def _nodes(n: int) -> NDArray[np.float64]:
     return np.stack([cube.face_directions(face, edge[None, :], edge[:, None]) for face in range(6)])
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sum_texels(flux, moment, source, shrink, tile, center, out):  # type: ignore[no-untyped-def]
+    fine, side = source * shrink, source // tile
+    sums = np.empty((2, 3))  # flux by colour, moment of all colours
+    for texel in range(len(center)):
+        face, row, column = texel // (source * source), texel // source % source, texel % source
+        sums[:] = 0.0
+        for i in range(row * shrink, (row + 1) * shrink):
+            for j in range(column * shrink, (column + 1) * shrink):
+                of = (face * fine + i) * fine + j
+                for c in range(3):
+                    sums[0, c] += flux[of, c]
+                    for axis in range(3):
+                        sums[1, axis] += moment[of, c, axis]
+        to = out[(face * side + row // tile) * side + column // tile]
+        place = row % tile * tile + column % tile
+        length = math.sqrt(sums[1, 0] ** 2 + sums[1, 1] ** 2 + sums[1, 2] ** 2)
+        for c in range(3):
+            to[c, place] = sums[0, c]
+            to[3 + c, place] = sums[1, c] / length - center[texel, c] if length > 0.0 else 0.0
+
+
 @njit(cache=True, nogil=True)
 def _meet(around, share, radiance, out):  # type: ignore[no-untyped-def]
     for m in range(len(around)):
@@ -178,12 +214,12 @@ def _weigh(node, start, tiles, center, near, end, exponent, scale, tile, weight)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
-def _convolve(node, start, tile, weight, light, out):  # type: ignore[no-untyped-def]
-    """light (tiles, 6, T): flux, and the way from a texel's centre to its light over the kernel's variance. With it
-    the kernel is exp(r . way) times that at the centre; the series is within 1 % of the peak."""
+def _convolve(node, start, tile, weight, light, steep, out):  # type: ignore[no-untyped-def]
+    """light (tiles, 6, T): flux, and the way from a texel's centre to its light; steep: 1 over the kernel's variance.
+    The kernel is exp(steep r . way) times that at the centre; the series is within 1 % of the peak."""
     one = np.float32(1.0)
     for m in range(len(node)):
-        x, y, z = node[m, 0], node[m, 1], node[m, 2]
+        x, y, z = steep * node[m, 0], steep * node[m, 1], steep * node[m, 2]
         red = green = blue = np.float32(0.0)
         for p in range(start[m], start[m + 1]):
             of, w = light[tile[p]], weight[p]
