@@ -77,10 +77,6 @@ def test_pictures_with_shadows_lamps_and_a_bounce(scene, store):
     each for the bounce, which is 5 % of the picture (0.096)."""
     ours = read_layers(render(store, "ours.exr", layers=True))
     truth = read_layers(render(scene, "truth.exr", layers=True, reference=True, spp=256, bounces=1))
-        flip_hdr(ours[""], truth[""]).mean(),
-        relative_rmse(ours["direct"], truth["direct"]),
-        relative_rmse(ours["one_bounce"], truth["one_bounce"]),
-    )
     assert flip_hdr(ours[""], truth[""]).mean() < 0.06
     assert relative_rmse(ours["direct"], truth["direct"]) < 0.04
     assert relative_rmse(ours["one_bounce"], truth["one_bounce"]) < 0.15
