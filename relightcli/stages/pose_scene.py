@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.adapters.rays import Tracer
@@ -173,13 +174,30 @@ def _ball(light: SphereLight | RectangleLight) -> tuple[NDArray[np.float64], flo
 def _unless_changed(before: U8, after: U8, cells: int) -> tuple[U8, NDArray[np.bool_]]:
     """The bits after, with all texels open in cells where nothing has changed; and the cells (N, 6, C, C) where it
     has."""
-    resolution = after.shape[2]
-    side = resolution // cells
-    differ = np.unpackbits(before ^ after, axis=3, bitorder="little")
-    changed: NDArray[np.bool_] = np.asarray(differ.reshape(len(after), 6, cells, side, cells, side).any(axis=(3, 5)))
-    same = np.repeat(np.repeat(~changed, side, axis=2), side, axis=3)
-    out: U8 = after | np.packbits(same, axis=3, bitorder="little")
+    changed = np.zeros((len(after), 6, cells, cells), np.bool_)
+    out = after.copy()
+    _open_unchanged(before, after, changed, out)
     return out, changed
+
+
+@njit(cache=True)
+def _open_unchanged(before, after, changed, out):  # type: ignore[no-untyped-def]
+    resolution, cells = after.shape[2], changed.shape[2]
+    side = resolution // cells
+    for i in range(len(after)):
+        for f in range(6):
+            for row in range(resolution):
+                for byte in range(resolution // 8):
+                    differ = before[i, f, row, byte] ^ after[i, f, row, byte]
+                    if differ:
+                        for k in range(8):
+                            if (differ >> np.uint8(k)) & np.uint8(1):
+                                changed[i, f, row // side, (8 * byte + k) // side] = True
+            for row in range(resolution):
+                for byte in range(resolution // 8):
+                    for k in range(8):
+                        if not changed[i, f, row // side, (8 * byte + k) // side]:
+                            out[i, f, row, byte] |= np.uint8(1) << np.uint8(k)
 
 
 def _finer(bits: U8, resolution: int) -> U8:

@@ -18,9 +18,10 @@ from relightcli.core.transport.tracer import Tracer
 
 BATCH = 64  # receivers whose rays are traced together
 COARSE = 16  # cells along a cube face in which balls are looked for
+ROUNDING = 1e-5  # radians, of directions in float32
 
 
-PARTS = 32  # balls about a mesh, at most
+PARTS = 64  # balls about a mesh, at most: a bit each
 
 
 class Balls(NamedTuple):
@@ -77,7 +78,7 @@ def block(
         own = np.ascontiguousarray(bits[part]).reshape(len(bits[part]), -1)
         origin, normal = positions[part], np.ascontiguousarray(normals[part], np.float32)
         mark = _mark(origin, normal, balls.center, balls.radius, centers, reach)
-        count = _rays(mark, own, directions, cells, side, owner, towards, texel)
+        count = _rays(origin, balls.center, balls.radius, mark, own, directions, cells, side, owner, towards, texel)
         blocked = tracer.occluded(tracer.offset(origin, normal)[owner[:count]], towards[:count])
         rays += count
         if not blocked.any():
@@ -94,8 +95,8 @@ def block(
 
 @njit(cache=True)
 def _mark(points, normals, centers, radii, directions, reach):  # type: ignore[no-untyped-def]
-    """Cells (N, C) with directions in which a ball may be seen."""
-    mark = np.zeros((len(points), len(directions)), np.bool_)
+    """Balls that may be seen through cells (N, C): a bit for each but the first."""
+    mark = np.zeros((len(points), len(directions)), np.uint64)
     cells = np.empty(len(directions), np.int64)
     for i in range(len(points)):
         count = len(directions)
@@ -108,8 +109,7 @@ def _mark(points, normals, centers, radii, directions, reach):  # type: ignore[n
                     break
                 continue
             far = math.sqrt(x * x + y * y + z * z)
-            angle = math.pi if far <= radii[b] else math.asin(radii[b] / far) + reach
-            least = -2.0 * far if angle >= math.pi else far * math.cos(angle)
+            least = _least(far, radii[b], reach)
             found = 0
             for k in range(count):
                 c = cells[k]
@@ -118,29 +118,54 @@ def _mark(points, normals, centers, radii, directions, reach):  # type: ignore[n
                         cells[found] = c
                         found += 1
                     else:
-                        mark[i, c] = True
+                        mark[i, c] |= np.uint64(1) << np.uint64(b - 1)
             if b == 0:
                 count = found
     return mark
 
 
 @njit(cache=True)
-def _rays(mark, bits, directions, cells, side, owner, towards, texel):  # type: ignore[no-untyped-def]
-    """The open texels of the marked cells: fills owner, towards and texel, returns how many."""
+def _least(far, radius, reach):  # type: ignore[no-untyped-def]
+    """Least product of a direction and the way to a ball's centre, `far` long, for the ball to be within `reach`."""
+    angle = math.pi if far <= radius else math.asin(radius / far) + reach
+    return -2.0 * far if angle >= math.pi else far * math.cos(angle)
+
+
+@njit(cache=True)
+def _rays(points, centers, radii, mark, bits, directions, cells, side, owner, towards, texel):  # type: ignore[no-untyped-def]
+    """The open texels towards balls: fills owner, towards and texel, returns how many."""
     resolution = cells * side
     count = 0
+    way, least = np.empty((len(centers), 3)), np.empty(len(centers))
+    own = np.empty(len(centers), np.int64)
     for i in range(len(mark)):
+        for b in range(1, len(centers)):
+            for k in range(3):
+                way[b, k] = centers[b, k] - points[i, k]
+            far = math.sqrt(way[b, 0] ** 2 + way[b, 1] ** 2 + way[b, 2] ** 2)
+            least[b] = _least(far, radii[b], ROUNDING)
         for c in range(mark.shape[1]):
-            if not mark[i, c]:
+            if mark[i, c] == np.uint64(0):
                 continue
+            number = 0
+            for b in range(1, len(centers)):
+                if (mark[i, c] >> np.uint64(b - 1)) & np.uint64(1):
+                    own[number] = b
+                    number += 1
             face, row, column = c // (cells * cells), (c // cells) % cells, c % cells
             first = (face * resolution + row * side) * resolution + column * side
             for a in range(side):
                 for t in range(first + a * resolution, first + a * resolution + side):
-                    if (bits[i, t >> 3] >> np.uint8(t & 7)) & np.uint8(1):
-                        owner[count], texel[count] = i, t
-                        towards[count] = directions[t]
-                        count += 1
+                    if not (bits[i, t >> 3] >> np.uint8(t & 7)) & np.uint8(1):
+                        continue
+                    d = directions[t]
+                    for k in range(number):
+                        b = own[k]
+                        if way[b, 0] * d[0] + way[b, 1] * d[1] + way[b, 2] * d[2] >= least[b]:
+                            owner[count], texel[count] = i, t
+                            towards[count] = d
+                            count += 1
+                            break
     return count
 
 
