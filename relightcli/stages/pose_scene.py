@@ -45,7 +45,6 @@ class PosedScene:
         self.at_rest = np.flatnonzero(np.isin(store.object, [k for k in skinned if k not in posed]))
         self.still = ~np.isin(store.object, skinned)
         self.faces = geometry.faces[np.isin(owner, skinned)]
-        self.characters = Tracer(geometry.positions, self.faces)
         self.surroundings = bool(store.store.settings.get("pose_surroundings"))
         self._skinned = skinned
         self._coarse: U8 | None = None
@@ -54,6 +53,10 @@ class PosedScene:
     def balls(self) -> Balls:
         """About the characters."""
         return bounding_balls(self.geometry.positions, self.faces)
+
+    @cached_property
+    def characters(self) -> Tracer:
+        return Tracer(self.geometry.positions, self.faces)
 
     @cached_property
     def everything(self) -> Tracer:
