@@ -151,6 +151,18 @@ def test_a_membrane_lets_the_sky_behind_it_through(tmp_path):
     np.testing.assert_allclose(radiance[side > 0], np.tile([0.3, 0.2, 0.1], ((side > 0).sum(), 1)), rtol=2e-3)
 
 
+@pytest.mark.parametrize("shape", ["scale = [1.6, 0.7, 1.0]", "scale = [-1, 1, 1]"])
+def test_stretched_and_mirrored_characters(tmp_path, shape):
+    """Normals under scales that differ by axis, and faces that turn around; from a clip of one frame beside `bend`."""
+    scene = make_scene(tmp_path, ALONE.replace('motion = "skinned"', f'motion = "skinned"\n{shape}'))
+    store = fit(make_store(scene, **SMALL))
+    for pose in (POSE, "bar=still@5"):
+        ours, _ = render(store, "ours.exr", poses=(pose,))
+        truth, _ = render(scene, "truth.exr", poses=(pose,), reference=True, spp=32)
+        assert flip_hdr(rgb(ours), rgb(truth)).mean() < 0.06
+        assert relative_rmse(rgb(ours), rgb(truth)) < 0.1  # as in `test_pictures_against_path_tracing`
+
+
 def test_sequences_vertices_and_radiance(fitted, tmp_path):
     shots = tmp_path / "shots.toml"
     shots.write_text(
