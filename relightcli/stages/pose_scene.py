@@ -34,33 +34,37 @@ SLAB = 1024  # receivers whose bits are unpacked at a time
 
 
 class PosedScene:
-    """What a pose store's receivers see in one pose of its characters. posed: those that have a model and a pose."""
+    """What a pose store's receivers see in one pose of its characters.
 
-    def __init__(self, store: PoseStore, posed: frozenset[int]) -> None:
+    posed: objects that have a model and a pose; apart: those that are not there, neither as blockers nor as receivers.
+    """
+
+    def __init__(self, store: PoseStore, posed: frozenset[int], apart: frozenset[int]) -> None:
         self.store, geometry = store, store.geometry
         self.geometry = geometry
         skinned = [geometry.object_names.index(name) for name in geometry.rigs]
-        owner = geometry.face_object
+        there = ~np.isin(geometry.face_object, list(apart))
+        self.faces, self.owner = geometry.faces[there], geometry.face_object[there]
+        self.own_faces = geometry.faces[np.isin(geometry.face_object, skinned)]
         self.of_posed = np.flatnonzero(np.isin(store.object, list(posed)))
         self.at_rest = np.flatnonzero(np.isin(store.object, [k for k in skinned if k not in posed]))
-        self.still = ~np.isin(store.object, skinned)
-        self.faces = geometry.faces[np.isin(owner, skinned)]
+        self.still = ~np.isin(store.object, [*skinned, *apart])
         self.surroundings = bool(store.store.settings.get("pose_surroundings"))
         self._skinned = skinned
-        self._coarse: U8 | None = None
+        self._around: tuple[U8, U8] | None = None
 
     @cached_property
     def balls(self) -> Balls:
         """About the characters."""
-        return bounding_balls(self.geometry.positions, self.faces)
+        return bounding_balls(self.geometry.positions, self.own_faces)
 
     @cached_property
     def characters(self) -> Tracer:
-        return Tracer(self.geometry.positions, self.faces)
+        return Tracer(self.geometry.positions, self.own_faces)
 
     @cached_property
     def everything(self) -> Tracer:
-        return Tracer(self.geometry.positions, self.geometry.faces)
+        return Tracer(self.geometry.positions, self.faces)
 
     # -- the sky
 
@@ -94,21 +98,35 @@ class PosedScene:
         out = bits.copy()
         own = (rows >= part.start) & (rows < part.stop)
         out[rows[own] - part.start] = now[own]
-        if self._coarse is not None:
+        if self._around is not None:
             own = (self.of_posed >= part.start) & (self.of_posed < part.stop)
-            out[self.of_posed[own] - part.start] = self._coarse[own]
+            out[self.of_posed[own] - part.start] = self._around[1][own]
         return out
+
+    def look_around(self) -> tuple[U8, U8]:
+        """What posed receivers see of the sky, a ray for every cell, and the same as finely as the store's bits. From
+        then on `past` has these."""
+        if self._around is None:
+            self._around = self._look_around()
+        return self._around
+
+    def _look_around(self) -> tuple[U8, U8]:
+        store = self.store
+        cells = max(CELLS, int(store.store.settings.get("bounce_resolution", CELLS)))
+        coarse = self._trace(self.everything, self.of_posed, cells, 1)
+        horizon = horizon_bits(store.normal[self.of_posed], store.resolution)
+        return coarse, _finer(coarse, store.resolution) & horizon
 
     def beside(self, name: str, position: NDArray[np.float64], normal: NDArray[np.float32]) -> U8 | None:
         """Cells (N, 6, C, C/8) of points on a posed object that nothing but itself blocks; None where there is nothing
         else. Surroundings that are in the model already do not count."""
         geometry = self.geometry
-        others = geometry.face_object != geometry.object_names.index(name)
+        others = self.owner != geometry.object_names.index(name)
         if self.surroundings:
-            others &= np.isin(geometry.face_object, self._skinned)
+            others &= np.isin(self.owner, self._skinned)
         if not others.any():
             return None
-        tracer = Tracer(geometry.positions, geometry.faces[others])
+        tracer = Tracer(geometry.positions, self.faces[others])
         return trace_visibility(tracer, position, normal, CELLS, REFINE, 0).bits
 
     def _trace(self, tracer: Tracer, rows: NDArray[np.int64], resolution: int, refine: int) -> U8:
@@ -138,31 +156,30 @@ class PosedScene:
         if not len(self.of_posed):
             return out
         own, normal = self.of_posed, store.normal[self.of_posed]
-        coarse = self._trace(self.everything, own, max(CELLS, cells), 1)
+        coarse, bits = self.look_around()
         found = trace_hits(self.everything, surfaces, store.position[own], normal, coarse, cells, len(rows), 0)[0]
-        self._coarse = _finer(coarse, store.resolution) & horizon_bits(normal, store.resolution)
-        return replace_rows(out, own, build_gather(found, self._coarse, normal, store.threads))
+        return replace_rows(out, own, build_gather(found, bits, normal, store.threads))
 
     def _surfaces(self) -> Surfaces:
         geometry, store = self.geometry, self.store
         front, back = store.receiver_of_vertex()
-        two_sided = geometry.two_sided[geometry.face_object]
-        return Surfaces(geometry.positions, geometry.normals, geometry.faces, two_sided, front, back, store.buried())
+        two_sided = geometry.two_sided[self.owner]
+        return Surfaces(geometry.positions, geometry.normals, self.faces, two_sided, front, back, store.buried())
 
     # -- local lights
 
     def light_bits(self, stored: U8, lights: LocalLights, specs: list[SphereLight | RectangleLight]) -> U8:
-        """Bits of the lights' points that every receiver sees, from those of the store."""
+        """Bits of the lights' points that every receiver sees, from those past what stands still."""
         store, out = self.store, stored.copy()
-        near = np.zeros(len(store), bool)
+        near = np.zeros(len(stored), bool)
         balls = self.balls
         for spec in specs:
             center, radius = _ball(spec)
             for x, r in zip(balls.center, balls.radius, strict=True):
-                near |= may_block(store.position, center, radius, x, float(r))
-        rows = np.flatnonzero(near & self.still)
+                near |= may_block(store.position[: len(stored)], center, radius, x, float(r))
+        rows = np.flatnonzero(near & self.still[: len(stored)])
         out[rows] &= light_bits(self.characters, lights, store.position[rows], store.normal[rows])[0]
-        rows = np.flatnonzero(~self.still)
+        rows = np.flatnonzero(np.isin(store.object[: len(stored)], self._skinned))
         out[rows] = light_bits(self.everything, lights, store.position[rows], store.normal[rows])[0]
         return out
 

@@ -37,6 +37,7 @@ from relightcli.core.sphere import sh
 from relightcli.core.transport.local_lights import LocalLights
 from relightcli.core.transport.transfer import local_rotations
 from relightcli.errors import InputError, StoreError
+from relightcli.scene.model import Geometry
 from relightcli.scene.posing import resolve_poses
 from relightcli.stages.lighting import IN_MEMORY, LightingStore, _Coats
 from relightcli.stages.pose_scene import PosedScene
@@ -61,6 +62,7 @@ class PoseStore(LightingStore):
         self._light_bits: U8 | None = None
         self._beside: dict[tuple[str, bool], U8 | None] = {}
         self._hits: NDArray[np.int32] | None = None
+        self._apart: frozenset[int] = frozenset()  # objects that characters neither block nor are blocked by here
 
     def set_poses(self, poses: tuple[str, ...]) -> list[str]:
         """Poses objects, as `--pose` takes them, those not named as they rest; what there is to say about it.
@@ -68,7 +70,12 @@ class PoseStore(LightingStore):
         Raises InputError for unknown objects and clips, for objects that the store has no model of, and where a fixed
         camera's pixels would have to follow.
         """
-        geometry, position, normal = self._rest
+        return self._pose(poses, *self._rest)
+
+    def _pose(
+        self, poses: tuple[str, ...], geometry: Geometry, position: NDArray[np.float64], normal: NDArray[np.float32]
+    ) -> list[str]:
+        """`set_poses`, where all that is not posed has this geometry and these receivers."""
         resolved, notes = resolve_poses(self.scene, geometry, poses)
         self._posed, self._scene, self._gather, self._light_bits, self._beside = {}, None, None, None, {}
         self.geometry, self.position, self.normal = geometry, position, normal
@@ -97,7 +104,8 @@ class PoseStore(LightingStore):
                 )
         self.geometry = replace(geometry, positions=positions, normals=normals)
         if "shadows" in self.store.settings["effects"]:
-            self._scene = PosedScene(self, frozenset(geometry.object_names.index(name) for name in resolved))
+            numbers = frozenset(geometry.object_names.index(name) for name in resolved)
+            self._scene = PosedScene(self, numbers, self._apart)
         return notes
 
     def _object(self, name: str) -> PosedObject:
