@@ -40,7 +40,7 @@ def store(scene):
 
 
 def test_pictures_of_both(scene, store):
-    """A ball under the bent bar; FLIP of 0.06 was set out to be reached under smooth skies. Four bands on and behind the
+    """A ball under the bent bar; FLIP of 0.06 was set out to be reached under smooth skies. Four bands about the
     ball, and shadow edges between the floor's vertices, left 0.028 of direct light when this was written; cells, sites
     and bands 0.123 of the bounce."""
     ours = read_layers(render(store, "ours.exr", poses=(POSE,), moves=NEAR, layers=True))
