@@ -35,7 +35,8 @@ mesh = "floor.obj"
 material = "grey"
 [materials.grey]
 diffuse = [0.5, 0.5, 0.5]
-[environments.sky]
+"""
+SKY = """[environments.sky]
 map = "sky.exr"
 """
 CAMERA = """[cameras.at{k}]
@@ -100,13 +101,26 @@ def measure_rigs(setting: Setting, data: Path, report: Report) -> list[tuple[str
             spp = 16 if setting.quick else SAMPLES
             run_tool("relight", scene, *pose, "-o", truth, "--reference", "--spp", str(spp))
             a, b = (read_image(path).pixels[..., :3] for path in (ours, truth))
-            flip, error = float(flip_hdr(a, b).mean()), relative_rmse(a, b)
+            where = flip_hdr(a, b)
+            flip, error = float(where.mean()), relative_rmse(a, b)
+            mask = folder / f"mask{k}.exr"
+            run_tool("relight", folder / "alone.toml", *pose, "-o", mask, "--reference", "--spp", "4")
+            own = float(where[read_image(mask).pixels[..., 3] > 0.5].mean())
             work = f"{rig.name}, {moment}: FLIP"
             report.rows.append(Row(work, flip, "", target=f"<= {FLIP_LIMIT}", met=flip <= FLIP_LIMIT))
             ratio = held["model"] / held["projection"]
-            rows.append((rig.name, moment, held["bands"], ratio, 100 * error, told["lighting_seconds"]))
+            rows.append((rig.name, moment, held["bands"], ratio, 100 * error, flip, own, told["lighting_seconds"]))
         made.append((rig.name, transfer))
-    columns = ("rig", "moment", "held-out error", "over four bands' error", "picture's relative RMS, %", "relight, s")
+    columns = (
+        "rig",
+        "moment",
+        "held-out error",
+        "over four bands' error",
+        "picture's relative RMS, %",
+        "FLIP",
+        "on the character",
+        "relight, s",
+    )
     report.tables.append(Table("rigs, on a floor that they shade", columns, tuple(rows)))
     return made
 
@@ -140,13 +154,14 @@ def _write(setting: Setting, data: Path, rig: Rig, folder: Path) -> Path:
     scene = load_scene(path)
     posed = [apply_poses(scene, build_geometry(scene), [f"subject={m}"])[0].positions for m in rig.moments]
     low, size = min(p[:, 1].min() for p in posed), float(np.ptp(posed[0], axis=0).max())
-    text = path.read_text() + FLOOR
+    text = SKY
     for k, positions in enumerate(posed):
         middle = 0.5 * (positions.min(axis=0) + positions.max(axis=0))
         eye = middle + size * np.array([1.5, 0.6, 1.2])
         side = 48 if setting.quick else SIDE
         text += CAMERA.format(k=k, eye=eye.tolist(), target=middle.tolist(), side=side)
-    path.write_text(text)
+    (folder / "alone.toml").write_text(path.read_text() + text)
+    path.write_text(path.read_text() + FLOOR + text)
     middles = np.array([0.5 * (p.min(axis=0) + p.max(axis=0)) for p in posed])
     (x0, _, z0), (x1, _, z1) = middles.min(axis=0) - 3 * size, middles.max(axis=0) + 3 * size
     corners = [(x0, z0), (x0, z1), (x1, z1), (x1, z0)]
