@@ -90,7 +90,7 @@ def measure_rigs(setting: Setting, data: Path, report: Report) -> list[tuple[str
         about = told["objects"][0]
         held, size = about["held_out"], about["bytes"] / 1e6
         report.rows += [
-            at_most(f"{rig.name}: training of {about['frames']} frames", training, "s", 300.0),
+            at_most(f"{rig.name}: training of {about['frames']} frames, one core", training, "s", 300.0),
             at_most(f"{rig.name}: fit of {about['vertices']} vertices", about["seconds"], "s", 10.0),
             at_most(f"{rig.name}: model", size, "MB", 5.0),
         ]
@@ -126,11 +126,11 @@ def measure_rigs(setting: Setting, data: Path, report: Report) -> list[tuple[str
 
 
 def _training_seconds(transfer: Path) -> float:
-    """Seconds of tracing the poses, of all processes together: no more than a run on one core takes."""
+    """Processor time of tracing the poses, of all processes together: what a run on one core takes."""
     import relight_formats as formats
 
     blocks = formats.open_store(transfer).blocks
-    return float(sum(block["seconds"] for block in blocks if block["id"].startswith("pose/")))
+    return float(sum(block["cpu_seconds"] for block in blocks if block["id"].startswith("pose/")))
 
 
 def _write(setting: Setting, data: Path, rig: Rig, folder: Path) -> Path:
