@@ -2,8 +2,9 @@
 
 The limb bends and twists by three clips whose angles are sums of sines. Errors are those of the fit's report: relative
 RMS of four bands of visibility, at the training frames and at frames that were held out, and against all of visibility
-as it was traced. Rows of one table are the curves of the paper's Fig. 3 (weights) and 5 (lobes) in numbers: mean and
-standard deviation over the frames. Rates are of vertex colours, without the mesh and the picture.
+as it was traced. Two tables are the paper's Fig. 3 (weights) and 5 (lobes) in numbers: mean and
+standard deviation over the frames; `pose-fig3` and `pose-fig5`, `.png` and `.svg` beside the results, are the curves.
+Rates are of vertex colours, without the mesh and the picture. Whole characters are in `pose_rigs.py`.
 """
 
 from __future__ import annotations
@@ -11,27 +12,26 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.pose_figures import Training, figures
+from benchmarks.pose_rigs import measure_rigs
 from benchmarks.processes import cores
 from benchmarks.report import Report, Row, Table, at_most
-from benchmarks.scenes import Setting
-from relight_formats import quantise
+from benchmarks.scenes import Setting, shared_data
+from relight_formats import open_store, quantise
 from relightcli.adapters.rays import Tracer
 from relightcli.core.pose.clip import Channel, Clip
 from relightcli.core.pose.phong_operator import phong_factors
 from relightcli.core.pose.pose_model import (
     PoseModel,
     Settings,
-    cosine_weighted,
     fit_model,
-    predict,
-    relative,
 )
-from relightcli.core.pose.pose_model import Report as Fitted
 from relightcli.core.pose.rig import Rig, any_tangents, clip_features, joint_matrices, skin
 from relightcli.core.pose.shading import lighting, shade, synthesis
 from relightcli.core.pose.visibility import hemisphere_directions, trace_visibility
@@ -133,13 +133,11 @@ def measure(setting: Setting) -> Report:
     )
     report.rows.append(Row("visibility traced, one process", rate / 1e6, "Mray/s"))
     rows: list[tuple[Any, ...]] = []
-    fits: dict[str, tuple[PoseModel, Fitted]] = {}
     some = np.arange(count) % seen.shape[1]
     whole = np.ascontiguousarray(seen[:, some])
     fit_model(features, seen[:, :8], clip, Settings())  # compiled before it is timed
     for name, settings in VARIANTS:
-        fits[name] = fit_model(features, seen, clip, settings, cores())
-        found = fits[name][1]
+        found = fit_model(features, seen, clip, settings, cores())[1]
         started = time.perf_counter()
         large, _ = fit_model(features, whole, clip, settings, cores())
         seconds = time.perf_counter() - started
@@ -187,19 +185,20 @@ def measure(setting: Setting) -> Report:
             tuple(rows),
         )
     )
-    plain = predict(fits["2 lobes"][0], features)
-    report.tables.append(
-        Table(
-            "weights, at the training frames (the paper's Fig. 3)",
-            ("fit", "error"),
-            (
-                ("visibility", relative(plain, seen)),
-                ("visibility, then the cosine", relative(cosine_weighted(plain), cosine_weighted(seen))),
-                ("visibility times the cosine", fits["2 lobes, cosine-weighted"][1].training.bands),
-            ),
-        )
-    )
+    rigs = {"limb": (features, seen, clip)}
+    data = shared_data()
+    if data is None:
+        report.skipped.append("CesiumMan, Fox and CMU motion: no test data")
+    else:
+        for name, transfer in measure_rigs(setting, data, report):
+            rigs[name] = _training(transfer)
+    figures(report, setting.work.parent, rigs, cores())
     return report
+
+
+def _training(transfer: Path) -> Training:
+    read: Any = open_store(transfer).read
+    return read("pose/0/features"), read("pose/0/visibility").astype(np.float32), read("pose/0/clip")
 
 
 def _size_and_rate(model: PoseModel, settings: Settings) -> tuple[int, float]:

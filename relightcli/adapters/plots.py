@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,17 +64,43 @@ def _limits(values: Sequence[float]) -> tuple[float, float]:
     return min(values) / 1.4, max(values) * 1.4
 
 
-def bars(title: str, y_name: str, names: Sequence[str], parts: dict[str, Sequence[float]]) -> dict[str, bytes]:
-    """A group of bars per name, one bar per part. Returns the file's bytes by suffix."""
+def bars(
+    title: str,
+    y_name: str,
+    names: Sequence[str],
+    parts: Mapping[str, Sequence[float]],
+    spreads: Mapping[str, Sequence[float]] | None = None,
+    x_name: str = "",
+) -> dict[str, bytes]:
+    """A group of bars per name, one bar per part; spreads: how far lines over the bars reach up and down.
+
+    Returns the file's bytes by suffix.
+    """
     import matplotlib
 
     with matplotlib.rc_context({"svg.hashsalt": "relightcli", "font.size": 10}):
-        figure = _figure(title, "point", y_name, logarithmic=False)
+        figure = _figure(title, x_name, y_name, logarithmic=False)
         axes = figure.axes[0]
         width = 0.8 / max(1, len(parts))
         for k, (part, values) in enumerate(parts.items()):
-            axes.bar([i + (k - (len(parts) - 1) / 2) * width for i in range(len(names))], values, width, label=part)
+            places = [i + (k - (len(parts) - 1) / 2) * width for i in range(len(names))]
+            above = None if spreads is None else spreads[part]
+            axes.bar(places, values, width, label=part, yerr=above, error_kw={"linewidth": 0.8})
         axes.set_xticks(range(len(names)), names)
+        axes.legend(frameon=False, fontsize=9)
+        return _bytes(figure)
+
+
+def curves(title: str, x_name: str, y_name: str, lines: Mapping[str, Sequence[float]]) -> dict[str, bytes]:
+    """Lines over 1, 2, 3, ... from 0 up. Returns the file's bytes by suffix."""
+    import matplotlib
+
+    with matplotlib.rc_context({"svg.hashsalt": "relightcli", "font.size": 10}):
+        figure = _figure(title, x_name, y_name, logarithmic=False)
+        axes = figure.axes[0]
+        for name, values in lines.items():
+            axes.plot(range(1, len(values) + 1), values, linewidth=1.2, label=name)
+        axes.set_ylim(bottom=0.0)
         axes.legend(frameon=False, fontsize=9)
         return _bytes(figure)
 

@@ -105,7 +105,7 @@ def decide(
 
     both_sides: any object is lit from both; lobes: any material has a specular lobe, or may get one; bounces: None
     leaves their number to the plan; tolerance: relative RMS; pilot: makes the measurements, called only if
-    needed; moving: objects may be moved, and are traced apart.
+    needed; moving: objects may be moved or posed.
     """
     shadows = _shadows(asked, positions, faces, both_sides, moving)
     allowed = SKIPPED * tolerance
@@ -190,7 +190,7 @@ def _shadows(
     moving: bool,
 ) -> Decision:
     if moving:
-        return Decision("shadows", True, "objects may be moved in front of one another")
+        return Decision("shadows", True, "objects may be moved or posed in front of one another")
     if asked is not None:
         return Decision("shadows", "shadows" in asked, "asked for with --effects")
     if both_sides:

@@ -172,9 +172,10 @@ def copy_arrays(store: formats.Store, writer: formats.Writer, names: list[str]) 
             attrs=attributes,
             codec="zstd" if any(c["name"] == "zstd" for c in source.metadata.to_dict()["codecs"]) else "lz4",
         )
-        step = max(1, layout.chunks[0])
-        for start in range(0, layout.shape[0], step):
-            target[start : start + step] = source[start : start + step]
+        step = max(1, layout.chunks[0]) if layout.shape else 1
+        for start in range(0, layout.shape[0] if layout.shape else 1, step):
+            rows = slice(start, start + step) if layout.shape else ...
+            target[rows] = source[rows]
         writer.record(f"copy/{name}", {})
 
 

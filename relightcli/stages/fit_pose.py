@@ -118,7 +118,7 @@ def _fit(config: Config, store: formats.Store, writer: formats.Writer, k: str, a
     clock = time.perf_counter()
     read: Any = store.read
     features: NDArray[np.float64] = read(f"pose/{k}/features")
-    visibility: NDArray[np.float32] = read(f"pose/{k}/visibility")
+    visibility: NDArray[np.float32] = read(f"pose/{k}/visibility").astype(np.float32)
     clip: NDArray[np.int32] = read(f"pose/{k}/clip")
     settings = Settings(config.model, config.lobes, config.axes, config.weight, config.ridge, config.components)
     try:

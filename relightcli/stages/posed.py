@@ -1,14 +1,16 @@
 """A pose store made ready to light: skinned objects in any pose, everything else as in the transfer store it came from.
 
-A posed object is lit by the sky directly, shadowed by its own body as the model of its visibility has it (and by its
-surroundings, if training saw them). It casts no shadow on others, and no light: `--reference` does both. Objects that
-are not posed stand in their rest pose and are lit from their visibility bits.
+A posed object is lit by the sky past its own body as the model of its visibility has it, and past everything else as
+rays have it; by local lights, as rays have them. It takes light from what stands still, and in interreflections sends
+some there (`pose_scene`). With no pose named, all is as in the transfer store, where characters stand at rest and
+nothing else knows of them.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,71 +20,33 @@ from numpy.typing import NDArray
 import relight_formats as formats
 from relightcli.core.brdf.models import PHONG, SHININESS, SPECULAR
 from relightcli.core.brdf.separable import POLAR
-from relightcli.core.lights.environment import SkyCube
-from relightcli.core.pose.clip import Clip
-from relightcli.core.pose.linear_model import distance
+from relightcli.core.lights.environment import SkyCube, splat
+from relightcli.core.pose.beside import (
+    band_profile,
+    incident_beside,
+    lambert_profile,
+    shade_beside,
+    sky_cells,
+)
 from relightcli.core.pose.phong_operator import phong_factors
-from relightcli.core.pose.rig import Rig, pose_features, posed
-from relightcli.core.pose.shading import Synthesis, incident, lighting, shade, synthesis
+from relightcli.core.pose.shading import incident, lighting, shade, visibility
+from relightcli.core.shade.gather import Gather
+from relightcli.core.shade.irradiance import irradiance, moment_prefix
 from relightcli.core.shade.low_order import response, shade_low_order
 from relightcli.core.sphere import sh
+from relightcli.core.transport.local_lights import LocalLights
 from relightcli.core.transport.transfer import local_rotations
 from relightcli.errors import InputError, StoreError
-from relightcli.scene.model import Material
+from relightcli.scene.model import Geometry
 from relightcli.scene.posing import resolve_poses
-from relightcli.stages.lighting import LightingStore, Radiance, _Coats
+from relightcli.stages.lighting import IN_MEMORY, LightingStore, _Coats
+from relightcli.stages.pose_scene import PosedScene
+from relightcli.stages.posed_object import PosedObject, PosedState
 from relightcli.stages.rig_store import read_rigs
 
 F32 = NDArray[np.float32]
+U8 = NDArray[np.uint8]
 DIFFUSE = 1.0  # the exponent by which phong's kernel is lambert's
-
-
-class PosedObject:
-    """One skinned object: its model, which receivers are its vertices', and the pose it is in."""
-
-    def __init__(self, store: PoseStore, number: str, about: dict[str, Any], rig: Rig) -> None:
-        read: Any = store.store.read
-        group = f"pose/{number}"
-        self.name, self.weight, self.gap = str(about["object"]), str(about["weight"]), float(about["gap"])
-        self.rig, self.transform = rig, store.scene.objects[self.name].transform
-        self.features: NDArray[np.float64] = read(f"{group}/features")
-        self.mean: NDArray[np.float64] = read(f"{group}/model/pose_mean")
-        self.directions: NDArray[np.float64] = read(f"{group}/model/pose_direction")
-        self.model: Synthesis = synthesis(
-            read(f"{group}/model/intercept"),
-            read(f"{group}/model/slope_scale")[:, :, 0],
-            read(f"{group}/model/slope"),
-            read(f"{group}/model/centre"),
-            str(about["axes"]),
-            int(about["order"]),
-        )
-        self.vertices = np.flatnonzero(store.geometry.vertex_object == int(number))
-        front, back = store.receiver_of_vertex()
-        front, back = front[self.vertices], back[self.vertices]
-        self.front = np.flatnonzero(front >= 0)  # vertices of the rig, and their receivers
-        self.front_receiver = front[self.front]
-        self.back = np.flatnonzero(back >= 0)
-        self.back_receiver = back[self.back]
-
-    def at(self, clip: Clip, seconds: float) -> PosedState:
-        """Where the object is at that moment of a clip."""
-        position, normal, tangent = posed(self.rig, self.transform, clip, seconds)
-        frames = np.stack([tangent, np.cross(normal, tangent), normal], 1).astype(np.float32)
-        features = pose_features(self.rig, clip, seconds)
-        scores = (features - self.mean) @ self.directions
-        return PosedState(position, normal, frames, scores, distance(self.features, features))
-
-
-@dataclass(frozen=True)
-class PosedState:
-    """position, normal (V, 3) float64 and frames (V, 3, 3) float32 in the world; scores (K,); distance from the
-    training frames (`linear_model.distance`)."""
-
-    position: NDArray[np.float64]
-    normal: NDArray[np.float64]
-    frames: F32
-    scores: NDArray[np.float64]
-    distance: float
 
 
 class PoseStore(LightingStore):
@@ -90,32 +54,37 @@ class PoseStore(LightingStore):
 
     def __init__(self, store: Path | formats.Store, threads: int) -> None:
         super().__init__(store, threads)
-        self._rest = (self.geometry, self.position, self.normal, self.bounces)
+        self._rest = (self.geometry, self.position, self.normal)
         self._objects: dict[str, PosedObject] = {}
         self._posed: dict[str, PosedState] = {}
+        self._scene: PosedScene | None = None
+        self._gather: Gather | None = None
+        self._light_bits: U8 | None = None
+        self._beside: dict[tuple[str, bool], U8 | None] = {}
+        self._hits: NDArray[np.int32] | None = None
+        self._apart: frozenset[int] = frozenset()  # objects that characters neither block nor are blocked by here
 
     def set_poses(self, poses: tuple[str, ...]) -> list[str]:
         """Poses objects, as `--pose` takes them, those not named as they rest; what there is to say about it.
 
-        Raises InputError for unknown objects and clips, for objects that the store has no model of, and where local
-        lights or a fixed camera's pixels would have to follow.
+        Raises InputError for unknown objects and clips, for objects that the store has no model of, and where a fixed
+        camera's pixels would have to follow.
         """
-        geometry, position, normal, bounces = self._rest
+        return self._pose(poses, *self._rest)
+
+    def _pose(
+        self, poses: tuple[str, ...], geometry: Geometry, position: NDArray[np.float64], normal: NDArray[np.float32]
+    ) -> list[str]:
+        """`set_poses`, where all that is not posed has this geometry and these receivers."""
         resolved, notes = resolve_poses(self.scene, geometry, poses)
-        self._posed = {}
+        self._posed, self._scene, self._gather, self._light_bits, self._beside = {}, None, None, None, {}
         self.geometry, self.position, self.normal = geometry, position, normal
-        self.bounces = bounces if not resolved else 0
         if not resolved:
             return notes
         if self.camera_name is not None:
             raise InputError(
                 f"--pose: the receivers of {self.store.path} are the pixels of camera {self.camera_name!r}; "
                 "precompute with --receivers vertices"
-            )
-        if self.scene.lights:
-            raise InputError(
-                f"--pose: {self.store.path} has local lights ({', '.join(self.scene.lights)}), which do not follow "
-                "posed objects; use --reference"
             )
         positions, normals = geometry.positions.copy(), geometry.normals.copy()
         self.position, self.normal = position.copy(), normal.copy()
@@ -133,9 +102,10 @@ class PoseStore(LightingStore):
                     f"frame (root of the summed squared differences of features), and those are at most "
                     f"{item.gap:.2f} apart"
                 )
-        if bounces:
-            notes.append("posed pictures have direct light only")
         self.geometry = replace(geometry, positions=positions, normals=normals)
+        if "shadows" in self.store.settings["effects"]:
+            numbers = frozenset(geometry.object_names.index(name) for name in resolved)
+            self._scene = PosedScene(self, numbers, self._apart)
         return notes
 
     def _object(self, name: str) -> PosedObject:
@@ -160,20 +130,62 @@ class PoseStore(LightingStore):
             buried[item.front_receiver] = buried[item.back_receiver] = False
         return buried
 
-    def exit_radiance(
-        self,
-        environment: NDArray[np.float32],
-        rotate: float,
-        materials: dict[str, Material],
-        view: NDArray[np.float32] | None,
-        active: NDArray[np.bool_] | None = None,
-        basis: str | None = None,
-        bounces: int | None = None,
-    ) -> list[Radiance]:
-        """See `LightingStore.exit_radiance`. Raises InputError for interreflections about posed objects."""
-        if self._posed and bounces:
-            raise InputError(f"--bounces {bounces}: posed pictures have direct light only; --reference has them all")
-        return super().exit_radiance(environment, rotate, materials, view, active, basis, bounces)
+    # -- who sees what
+
+    def stored_blocks(self) -> Iterator[tuple[slice, U8]]:
+        """The bits of all receivers as the store has them."""
+        return super().blocks()
+
+    def blocks(self, first: int = 0, last: int | None = None) -> Iterator[tuple[slice, U8]]:
+        """See `LightingStore.blocks`; past characters where they are posed."""
+        for part, bits in super().blocks(first, last):
+            yield part, bits if self._scene is None else self._scene.past(part, bits)
+
+    def gather(self, first: int = 0) -> Gather | None:
+        """See `LightingStore.gather`; past characters, and to them, where they are posed."""
+        if self._scene is None:
+            return super().gather(first)
+        if self._gather is None:
+            scene, self._scene = self._scene, None
+            try:
+                stored = super().gather(first)
+            finally:
+                self._scene = scene
+            if stored is None:
+                return None
+            self._gather = scene.gather(stored, self._stored_hits())
+        return self._gather
+
+    def _stored_hits(self) -> NDArray[np.int32]:
+        if self._hits is not None:
+            return self._hits
+        hits: Any = self.store.read("bounce/hit")
+        if hits.nbytes <= IN_MEMORY:
+            self._hits = hits
+        return np.asarray(hits)
+
+    def _local_lights(self) -> tuple[U8, LocalLights] | None:
+        found = super()._local_lights()
+        if found is None or self._scene is None:
+            return found
+        if self._light_bits is None:
+            self._light_bits = self._scene.light_bits(*found, list(self.scene.lights.values()))
+        return self._light_bits, found[1]
+
+    def _open_cells(self, item: PosedObject, state: PosedState, back: bool = False) -> U8 | None:
+        """Cells that others leave open to the vertices of a posed object, or to its back's receivers."""
+        key = item.name, back
+        if key not in self._beside:
+            found = None
+            if self._scene is not None:
+                rows = item.back if back else np.arange(len(state.position))
+                sign = -1.0 if back else 1.0
+                normal = (sign * state.normal[rows]).astype(np.float32)
+                found = self._scene.beside(item.name, state.position[rows], normal)
+            self._beside[key] = found
+        return self._beside[key]
+
+    # -- light
 
     def _irradiance(self, sky: SkyCube, active: NDArray[np.bool_] | None, basis: str) -> NDArray[np.float32]:
         if not self._posed:
@@ -184,21 +196,53 @@ class PoseStore(LightingStore):
         out = np.zeros((len(self), 3), np.float32)
         if still.any():
             out[:] = super()._irradiance(sky, still, basis)
+            if basis != "visibility" and self._scene is not None:
+                self._take_off(sky, out)
         for name, state in self._posed.items():
             item = self._objects[name]
-            order = item.model.order
-            # A cosine-weighted model is lit by the light itself: kappa_0 = 4 makes l . v / pi of it.
-            kappa = np.array([4.0]) if item.weight == "cosine" else phong_factors(DIFFUSE, 2 * order - 1)
-            light = _light(sky, len(kappa), order)
-            normals = np.ascontiguousarray(state.frames[:, 2])
-            some = np.zeros(len(normals), np.int32)
-            e = shade(
-                item.model, state.scores, state.frames, normals, some, [lighting(kappa, light, order)], self.threads
-            )
-            out[item.front_receiver] = np.float32(math.pi) * e[item.front]
-            if len(item.back):  # nothing is known of what the back sees: the whole sky behind it [digest of Eq. 22]
-                out[item.back_receiver] = _open(sky, -state.normal[item.back])
+            out[item.front_receiver] = self._diffuse(item, state, sky)[item.front]
+            if len(item.back):
+                out[item.back_receiver] = self._behind(item, state, sky)
         return out
+
+    def _take_off(self, sky: SkyCube, out: F32) -> None:
+        """What a basis makes of the stored bits, times the share that is left of the light by the bits themselves."""
+        assert self._scene is not None
+        rows, before, now = self._scene.changed
+        prefix = moment_prefix(splat(sky))
+        was, left = (irradiance(bits, self.normal[rows], prefix, self.threads) for bits in (before, now))
+        out[rows] *= np.clip(left / np.maximum(was, np.float32(1e-30)), 0.0, 1.0)
+
+    def _diffuse(self, item: PosedObject, state: PosedState, sky: SkyCube) -> F32:
+        """Irradiance (V, 3) of a posed object's vertices."""
+        order = item.model.order
+        cosine = item.weight == "cosine"
+        normals = np.ascontiguousarray(state.frames[:, 2])
+        first = np.zeros(len(normals), np.int32)
+        # A cosine-weighted model is lit by the light itself: kappa_0 = 4 makes l . v / pi of it.
+        kappa = np.array([4.0]) if cosine else phong_factors(DIFFUSE, 2 * order - 1)
+        cells = self._open_cells(item, state)
+        if cells is None:
+            light = _light(sky, len(kappa), order)
+            lights = [lighting(kappa, light, order)]
+            e = shade(item.model, state.scores, state.frames, normals, first, lights, self.threads)
+        else:
+            seen = visibility(item.model, state.scores, state.frames)
+            profile = band_profile(kappa) if cosine else lambert_profile()
+            e = shade_beside(seen, cells, sky_cells(sky, order), normals, first, [profile], self.threads)
+        return np.float32(math.pi) * e
+
+    def _behind(self, item: PosedObject, state: PosedState, sky: SkyCube) -> F32:
+        """Irradiance of the backs: nothing is known of what the body hides from them. [digest of Eq. 22]"""
+        normals = -state.normal[item.back]
+        cells = self._open_cells(item, state, back=True)
+        if cells is None:
+            return _open(sky, normals)
+        whole = np.full((len(normals), 1), math.sqrt(4.0 * math.pi), np.float32)
+        first = np.zeros(len(normals), np.int32)
+        axis = np.ascontiguousarray(normals, np.float32)
+        e = shade_beside(whole, cells, sky_cells(sky, 1), axis, first, [lambert_profile()], self.threads)
+        return np.float32(math.pi) * e
 
     def _exact_specular(
         self,
@@ -255,22 +299,31 @@ class PoseStore(LightingStore):
         mirrored = 2.0 * cosine[:, None] * normal - towards
         colours = coats.table.parameters[:, SPECULAR : SPECULAR + 3].astype(np.float32)
         bands = 2 * order - 1
-        light = _light(sky, bands, order)
         found = np.zeros((len(material), 3), np.float32)
         used = np.unique(material[material >= 0])
         phong = [m for m in used if coats.table.model[m] == PHONG]
+        open_cells = self._open_cells(item, state)
+        seen = None if open_cells is None else visibility(item.model, state.scores, state.frames)
         if phong:
             place = np.full(len(coats.table.model) + 1, -1, np.int32)
             place[phong] = np.arange(len(phong))
-            lights = [
-                lighting(phong_factors(float(coats.table.parameters[m, SHININESS]), bands), light, order) for m in phong
-            ]
+            factors = [phong_factors(float(coats.table.parameters[m, SHININESS]), bands) for m in phong]
             axis = np.ascontiguousarray(mirrored, np.float32)
-            found = shade(item.model, state.scores, state.frames, axis, place[material], lights, self.threads)
+            kernel = place[material]
+            if seen is None or open_cells is None:
+                lights = [lighting(kappa, _light(sky, bands, order), order) for kappa in factors]
+                found = shade(item.model, state.scores, state.frames, axis, kernel, lights, self.threads)
+            else:
+                profiles = [band_profile(kappa) for kappa in factors]
+                cells = sky_cells(sky, order)
+                found = shade_beside(seen, open_cells, cells, axis, kernel, profiles, self.threads)
         others = [m for m in used if coats.table.model[m] != PHONG]
         if others:
             rows = np.flatnonzero(np.isin(material, others))
-            arriving = incident(item.model, state.scores, state.frames, _light(sky, order, order), self.threads)
+            if seen is None or open_cells is None:
+                arriving = incident(item.model, state.scores, state.frames, _light(sky, order, order), self.threads)
+            else:
+                arriving = incident_beside(seen, open_cells, sky_cells(sky, order), self.threads)
             turned = local_rotations(normal[rows].astype(np.float32), order)
             local = np.ascontiguousarray(np.einsum("nst,nct->ncs", turned, arriving[rows]))
             table = np.zeros((len(coats.table.model), POLAR, order * (order + 1) // 2), np.float32)

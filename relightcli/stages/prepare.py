@@ -122,6 +122,7 @@ def prepare(config: Config) -> Prepared:
         check_bounces(config)
     clock = time.perf_counter()
     fields = effects.decide_fields(asked, motions, len(scene.lights))
+    pose = effects.decide_pose(asked, {name: len(rig.clips) for name, rig in source.rigs.items()})
     plan, bounces = effects.decide(
         asked,
         source.positions,
@@ -131,13 +132,12 @@ def prepare(config: Config) -> Prepared:
         wanted,
         scene.tolerance if promise is None else promise,
         lambda: _Pilot(scene, source),
-        fields.simulate,
+        fields.simulate or (asked is None and pose.simulate),
     )
     planning = time.perf_counter() - clock
     if bounces:
         check_bounces(config)
-    plan.append(effects.decide_pose(asked, {name: len(rig.clips) for name, rig in source.rigs.items()}))
-    plan.append(fields)
+    plan += [pose, fields]
     simulated = [d.effect for d in plan if d.simulate]
     if promise is not None and any(name in simulated for name in MOVING):
         raise InputError(

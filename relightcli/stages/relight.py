@@ -82,6 +82,10 @@ def relight(config: Config) -> dict[str, Any]:
 def open_lighting(path: Path, threads: int) -> LightingStore:
     """The store of any stage that pictures are made from."""
     store = formats.open_store(path)
+    if "fields" in store.attrs and store.kind == "pose":
+        from relightcli.stages.posed_moving import PosedMovingStore
+
+        return PosedMovingStore(store, threads)
     if "fields" in store.attrs:
         from relightcli.stages.moving import MovingStore
 

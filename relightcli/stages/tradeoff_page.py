@@ -72,6 +72,7 @@ def _plots(result: Result) -> dict[str, dict[str, bytes]]:
         "relative to the picture, %",
         [f"#{k + 1}" for k in kept],
         {n: [100 * result.points[k].error.share.get(n, 0.0) for k in kept] for n in layers},
+        x_name="point",
     )
     return plots
 

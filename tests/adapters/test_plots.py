@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from relightcli.adapters.plots import Curve, bars, scatter
+from relightcli.adapters.plots import Curve, bars, curves, scatter
 
 
 @pytest.fixture(scope="module")
@@ -48,3 +48,13 @@ def test_bars():
     found = bars("T", "%", ["#1", "#2"], {"direct": [1.0, 2.0], "specular": [0.0, 0.5]})
     assert set(found) == {"png", "svg"}
     assert found == bars("T", "%", ["#1", "#2"], {"direct": [1.0, 2.0], "specular": [0.0, 0.5]})
+
+
+def test_curves_and_bars_that_vary():
+    lines = {"one": [0.1, 0.3], "two": [0.2, 0.2]}
+    found = curves("T", "frame", "error", lines)
+    assert found == curves("T", "frame", "error", lines)
+    assert found["png"].startswith(b"\x89PNG")
+    assert found != curves("T", "frame", "error", {**lines, "two": [0.2, 0.4]})
+    spread = {"one": [0.01, 0.02], "two": [0.0, 0.1]}
+    assert bars("T", "error", ["a", "b"], lines, spread) != bars("T", "error", ["a", "b"], lines)

@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -100,6 +100,31 @@ def join(parts: list[Gather]) -> Gather:
         np.concatenate([part.cell for part in parts]),
         np.concatenate([part.cosine for part in parts]),
         np.concatenate([part.solid_angle for part in parts]),
+    )
+
+
+def replace_rows(gather: Gather, rows: NDArray[np.int64], part: Gather) -> Gather:
+    """The gather with the entries of receivers rows (M,), rising, in the place of its own; part has M receivers."""
+    count = np.diff(gather.start)
+    count[rows] = np.diff(part.start)
+    start = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
+    stays = np.ones(len(count), bool)
+    stays[rows] = False
+    new = np.repeat(~stays, count)  # the entries that come from `part`
+    old = np.repeat(stays, np.diff(gather.start))
+
+    def put(mine: NDArray[Any], other: NDArray[Any]) -> NDArray[Any]:
+        out = np.empty(len(new), mine.dtype)
+        out[new], out[~new] = other, mine[old]
+        return out
+
+    return Gather(
+        gather.cells,
+        start,
+        put(gather.source, part.source),
+        put(gather.cell, part.cell),
+        put(gather.cosine, part.cosine),
+        put(gather.solid_angle, part.solid_angle),
     )
 
 
