@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeGuard
 
-from relight_formats.errors import StoreError
+from relight_formats.errors import AGAIN, StoreError
 from relight_formats.fingerprint import plain
 
 Codec = Literal["lz4", "zstd", "none"]
@@ -174,12 +174,12 @@ def read_layout(document: dict[str, Any], where: str) -> Layout:
 
     def need(condition: bool, key: str, expected: str) -> None:
         if not condition:
-            raise StoreError(f"{where}: {key}: expected {expected}, found {document.get(key)!r}; refused.")
+            raise StoreError(f"{where}: {key}: expected {expected}, found {document.get(key)!r}; refused. {AGAIN}")
 
     need(document.get("zarr_format") == 3 and document.get("node_type") == "array", "node_type", "a Zarr v3 array")
     unknown = sorted(document.keys() - _KEYS)
     if unknown:
-        raise StoreError(f"{where}: unknown keys {', '.join(unknown)}; refused.")
+        raise StoreError(f"{where}: unknown keys {', '.join(unknown)}; refused. {AGAIN}")
     shape, dims, dtype = document.get("shape"), document.get("dimension_names"), document.get("data_type")
     need(_whole(shape, 0), "shape", "a list of whole numbers")
     need(isinstance(dtype, str) and dtype in ITEM_BYTES, "data_type", f"one of {', '.join(ITEM_BYTES)}")

@@ -11,7 +11,7 @@ from zarr.abc.store import ByteRequest
 from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
 from zarr.storage import LocalStore
 
-from relight_formats.errors import StoreError
+from relight_formats.errors import AGAIN, StoreError
 from relight_formats.files import write_durably
 
 
@@ -69,10 +69,7 @@ class CommittedFolder(LocalStore):
         else:
             problem = chunk_problem(data)
         if problem:
-            raise StoreError(
-                f"{self.root}: array {array}: chunk file {path} {problem}; the store is damaged. "
-                f"Make it again (--overwrite)."
-            )
+            raise StoreError(f"{self.root}: array {array}: chunk file {path} {problem}; the store is damaged. {AGAIN}")
         return (prototype or default_buffer_prototype()).buffer.from_bytes(data)
 
 

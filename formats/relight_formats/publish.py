@@ -12,13 +12,13 @@ from typing import Any
 from relight_formats.errors import StoreError
 from relight_formats.files import REPLACED, fsync_folder, remove_store, sibling
 from relight_formats.header import is_store, read_root
-from relight_formats.ledger import FILE_NAME
+from relight_formats.ledger import DOCUMENTS, FILE_NAME
+from relight_formats.store import need_whole
 
 
 def publish(path: Path, partial: Path) -> None:
     """Give a sealed store its final name, replacing the one that may be there."""
-    with contextlib.suppress(FileNotFoundError):
-        os.unlink(partial / FILE_NAME)
+    _drop_notes(partial)
     replaced = sibling(path, REPLACED)
     if path.exists():
         if not is_store(path):
@@ -42,7 +42,7 @@ def tidy(path: Path, partial: Path) -> bool:
     """Finish what a crash interrupted; whether a sealed store took its final name by that. Needs the writer's lock.
 
     Raises:
-        StoreError: `NAME.replaced` is in the way and is no relight store.
+        StoreError: `NAME.replaced` is in the way and is no relight store; a sealed store was damaged since.
     """
     replaced = sibling(path, REPLACED)
     if replaced.exists():
@@ -53,6 +53,8 @@ def tidy(path: Path, partial: Path) -> bool:
             os.rename(replaced, path)
     if not sealed(partial):
         return False
+    _drop_notes(partial)
+    need_whole(partial)
     publish(path, partial)
     return True
 
@@ -64,6 +66,13 @@ def sealed(folder: Path) -> bool:
     except StoreError:
         return False
     return header["complete"] is True
+
+
+def _drop_notes(partial: Path) -> None:
+    """A sealed store holds in itself what they say."""
+    for name in (FILE_NAME, DOCUMENTS):
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(partial / name)
 
 
 def _need_ours(folder: Path) -> None:
