@@ -15,6 +15,9 @@ from relight_formats.fingerprint import fingerprint_json
 FORMAT = 1
 """Version of the store format that this package writes and reads."""
 
+DOCUMENT_LIMIT = 256 << 20
+"""Largest metadata document, bytes: a ledger of half a million blocks."""
+
 ROOT = "zarr.json"
 KEY = "relight"
 
@@ -70,9 +73,12 @@ def write_root(folder: Path, header: dict[str, Any], attributes: dict[str, Any])
 def load_document(file: Path, store: Path) -> tuple[dict[str, Any], bytes]:
     """A JSON object and its bytes. Raises StoreError when it is missing or no JSON object, OSError when unreadable."""
     try:
-        content = file.read_bytes()
+        with open(file, "rb") as stream:
+            content = stream.read(DOCUMENT_LIMIT + 1)
     except (FileNotFoundError, NotADirectoryError):
         raise StoreError(f"{store}: {file.name} is missing at {file.parent}; the store is damaged. {AGAIN}") from None
+    if len(content) > DOCUMENT_LIMIT:
+        raise StoreError(f"{file}: expected at most {DOCUMENT_LIMIT >> 20} MiB of metadata, found more; refused.")
     try:
         document = json.loads(content)
     except (ValueError, RecursionError) as error:

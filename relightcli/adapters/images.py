@@ -10,6 +10,7 @@ Rules, stated once:
 
 from __future__ import annotations
 
+import contextlib
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -131,6 +132,13 @@ class _Raw:
 
 
 def _read(path: Path) -> _Raw:
+    try:
+        return _read_decoded(path)
+    except UnicodeDecodeError:  # in the names of channels, or in what the library has to say of them
+        raise InputError(f"{path}: is damaged, or its header holds text that is not UTF-8; write it again.") from None
+
+
+def _read_decoded(path: Path) -> _Raw:
     oiio = load_oiio()
     if not path.exists():
         raise InputError(f"{path}: no such file; expected a picture.")
@@ -174,10 +182,20 @@ def _read(path: Path) -> _Raw:
     if primaries is not None and not np.allclose(primaries, REC709, atol=1e-3):
         notes.append(f"{path.name}: its primaries are not Rec.709; its values were taken as they are.")
 
-    metadata = {a.name: a.value for a in spec.extra_attribs if isinstance(a.value, str | int | float | tuple)}
+    metadata = _metadata(spec)
     straight = alpha if is_integer and spec.get_int_attribute("oiio:UnassociatedAlpha") else None
     pixels = _upright(_display_window(pixels, spec), spec.get_int_attribute("Orientation", 1))
     return _Raw(np.ascontiguousarray(pixels), tuple(spec.channelnames), metadata, display, straight, tuple(notes))
+
+
+def _metadata(spec: Any) -> dict[str, Any]:
+    """The header's own keys, without those whose text is not UTF-8."""
+    found = {}
+    for attribute in spec.extra_attribs:
+        with contextlib.suppress(UnicodeDecodeError):
+            if isinstance(value := attribute.value, str | int | float | tuple):
+                found[attribute.name] = value
+    return found
 
 
 def _check_header(path: Path, format_name: str, spec: Any) -> None:
