@@ -31,10 +31,11 @@ def publish(path: Path, partial: Path) -> None:
         remove_store(replaced)
 
 
-def discard(path: Path, partial: Path) -> None:
-    """Delete unfinished work. One rename first: half of a deleted store is never taken up as unfinished work."""
+def discard(path: Path, folder: Path) -> None:
+    """Delete unfinished work on `path`, or the store at `path` itself. One rename first: half of a deleted store is
+    never taken for a whole one."""
     replaced = sibling(path, REPLACED)
-    os.rename(partial, replaced)
+    os.rename(folder, replaced)
     remove_store(replaced)
 
 
@@ -47,7 +48,7 @@ def tidy(path: Path, partial: Path) -> bool:
     replaced = sibling(path, REPLACED)
     if replaced.exists():
         _need_ours(replaced)
-        if path.exists() or sealed(partial) or not sealed(replaced):
+        if path.exists() or sealed(partial) or not _whole(replaced):
             remove_store(replaced)
         else:
             os.rename(replaced, path)
@@ -66,6 +67,15 @@ def sealed(folder: Path) -> bool:
     except StoreError:
         return False
     return header["complete"] is True
+
+
+def _whole(folder: Path) -> bool:
+    """Whether a store is all there: a crash may have come while it was being deleted."""
+    try:
+        need_whole(folder)
+    except StoreError:
+        return False
+    return sealed(folder)
 
 
 def _drop_notes(partial: Path) -> None:

@@ -10,7 +10,6 @@ Rules, stated once:
 
 from __future__ import annotations
 
-import contextlib
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -134,8 +133,8 @@ class _Raw:
 def _read(path: Path) -> _Raw:
     try:
         return _read_decoded(path)
-    except UnicodeDecodeError:  # in the names of channels, or in what the library has to say of them
-        raise InputError(f"{path}: is damaged, or its header holds text that is not UTF-8; write it again.") from None
+    except UnicodeDecodeError:  # the library's message quotes the file
+        raise InputError(f"{path}: cannot be read as a picture (its header is damaged).") from None
 
 
 def _read_decoded(path: Path) -> _Raw:
@@ -179,23 +178,13 @@ def _read_decoded(path: Path) -> _Raw:
         if space and not space.startswith("srgb"):
             notes.append(f"{path.name}: is marked {space}; decoded as sRGB.")
     primaries = spec.getattribute("chromaticities")
-    if primaries is not None and not np.allclose(primaries, REC709, atol=1e-3):
+    if primaries is not None and (np.shape(primaries) != (8,) or not np.allclose(primaries, REC709, atol=1e-3)):
         notes.append(f"{path.name}: its primaries are not Rec.709; its values were taken as they are.")
 
-    metadata = _metadata(spec)
+    metadata = {a.name: a.value for a in spec.extra_attribs if isinstance(a.value, str | int | float | tuple)}
     straight = alpha if is_integer and spec.get_int_attribute("oiio:UnassociatedAlpha") else None
     pixels = _upright(_display_window(pixels, spec), spec.get_int_attribute("Orientation", 1))
     return _Raw(np.ascontiguousarray(pixels), tuple(spec.channelnames), metadata, display, straight, tuple(notes))
-
-
-def _metadata(spec: Any) -> dict[str, Any]:
-    """The header's own keys, without those whose text is not UTF-8."""
-    found = {}
-    for attribute in spec.extra_attribs:
-        with contextlib.suppress(UnicodeDecodeError):
-            if isinstance(value := attribute.value, str | int | float | tuple):
-                found[attribute.name] = value
-    return found
 
 
 def _check_header(path: Path, format_name: str, spec: Any) -> None:

@@ -484,6 +484,29 @@ class Campaign:
         self.need_right(station, "--overwrite")
         return f"format {version}"
 
+    def other_order(self, station: Station, rng: random.Random) -> str:
+        """Undisturbed, with 1, 2 or 4 workers or threads and the blocks in any order: the same bytes."""
+        workers, seed = rng.choice((1, 2, 4)), rng.random()
+
+        def shuffled(words: list[str]) -> None:
+            from relightcli.cli.main import main
+            from relightcli.run import blocks
+
+            known = blocks.run_blocks
+
+            def run_blocks(job, todo, ledger, **options):  # type: ignore[no-untyped-def]
+                todo = list(todo)
+                random.Random(seed).shuffle(todo)
+                known(job, todo, ledger, **options)
+
+            blocks.run_blocks = run_blocks
+            main(words)
+
+        child = Child(self.place, station.command(workers=workers), run=shuffled, watched=self.out)
+        self.end(child, (0,), f"{workers} workers")
+        self.need_right(station, f"{workers} workers")
+        return f"{workers} workers"
+
     # The run
 
     def trial(self, group: str, number: int, seed: int) -> dict[str, str | float]:
@@ -493,7 +516,7 @@ class Campaign:
             station = self.stations[(number + 1) % len(self.stations)]
         self.patience = HANG + 20.0 * self.expected[station.name].seconds
         fault = rng.choices(*zip(*GROUPS[group], strict=True))[0]
-        if station.name == "tradeoff" and fault in ("program_killed", "small_disk", "two_writers"):
+        if station.name == "tradeoff" and fault in ("program_killed", "small_disk", "two_writers", "other_order"):
             fault = GROUPS[group][0][0]
         clear(self.place)
         clock = time.monotonic()
@@ -524,6 +547,7 @@ GROUPS: dict[str, list[tuple[str, float]]] = {
         ("changed_input", 3),
         ("two_writers", 2),
         ("other_version", 2),
+        ("other_order", 3),
     ],
 }
 

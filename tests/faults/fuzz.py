@@ -38,12 +38,13 @@ from relightcli.errors import RelightError
 from relightcli.scene.model import Camera
 from relightcli.scene.motions import load_joint_map
 from relightcli.scene.parse import load_scene
+from relightcli.stages.relight import Config, relight
 from relightcli.stages.shots import Shot, read_shots
 from tests.adapters.test_meshes import FACET, SMALL_GLTF, TRIANGLE_OFF, TRIANGLE_PLY, binary_stl
 from tests.core.transport.scenes import lambert, square
 from tests.faults.damage import HARMS, harmed
 from tests.stages.pose_files import bar
-from tests.stages.scene_files import write_scene
+from tests.stages.scene_files import make_store, write_scene
 
 SECONDS = 2.0  # of computing, for one file
 MEMORY = 1 << 30  # beyond what the process has
@@ -255,6 +256,25 @@ def store_target(folder: Path) -> Target:
     return Target("store", ".seed", (b"0123456789abcdef",), read)
 
 
+def stage_target(folder: Path) -> Target:
+    """A transfer store whose description somebody has rewritten, with digests that fit: a picture is made from it."""
+    path = make_store(folder / "scene" / "scene.toml", light_resolution=16, subdivide=False)
+    original = (path / "zarr.json").read_bytes()
+
+    def read(file: Path) -> object:
+        rng = random.Random(file.read_bytes())
+        attributes = json.loads(original)["attributes"]
+        header = attributes.pop(KEY)
+        changed = mutated_json({"settings": header["settings"], "attributes": attributes}, rng)
+        if not isinstance(changed, dict) or not all(isinstance(v, dict) for v in changed.values()):
+            return None
+        header["settings"] = changed.get("settings", {})
+        write_root(path, header, changed.get("attributes", {}))
+        return relight(Config(path, str(folder / "stage.exr"), env=str(folder / "scene" / "sky-sky.exr")))
+
+    return Target("description", ".seed", (b"0123456789abcdef",), read)
+
+
 def _fit(path: Path, name: str) -> None:
     """Bring the ledger's and the root's digests in line with a changed document."""
     from relight_formats.fingerprint import fingerprint_bytes
@@ -267,6 +287,10 @@ def _fit(path: Path, name: str) -> None:
     attributes = json.loads(root_file.read_text())["attributes"]
     header = {**attributes.pop(KEY), "ledger": fingerprint_bytes(ledger_file.read_bytes())}
     write_root(path, header, attributes)
+
+
+def all_targets(folder: Path) -> list[Target]:
+    return [*file_targets(folder), store_target(folder), stage_target(folder)]
 
 
 def attempt(target: Target, folder: Path, rng: random.Random) -> str:
@@ -348,7 +372,7 @@ def main() -> int:
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory(dir="/dev/shm" if os.path.isdir("/dev/shm") else None) as name:
         folder = Path(name)
-        targets = [*file_targets(folder), store_target(folder)]
+        targets = all_targets(folder)
         count, problems = fuzz(targets, folder, asked.seed, 60.0 * asked.minutes)
     for target, files in count.items():
         print(f"{target}: {files} files")

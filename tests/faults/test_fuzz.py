@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from relightcli.errors import InputError
 from tests.faults import fuzz
 
-SAMPLED = ("scene", "keyframes", "BVH", "PLY", "GLB", "picture .exr", "store")
+SAMPLED = ("scene", "keyframes", "BVH", "PLY", "GLB", "picture .exr", "store", "description")
 
 
 @pytest.fixture(scope="module")
 def places(tmp_path_factory):
     folder = tmp_path_factory.mktemp("fuzz")
-    return folder, {t.name: t for t in [*fuzz.file_targets(folder), fuzz.store_target(folder)]}
+    return folder, {t.name: t for t in fuzz.all_targets(folder)}
 
 
 @pytest.mark.parametrize("name", SAMPLED)
