@@ -112,7 +112,8 @@ def open_committed(folder: Path, name: str) -> zarr.Array[Any]:
     """An array of a finished store, for reading."""
     store = CommittedFolder(folder)
     array: zarr.Array[Any] = zarr.open_array(store, path=name, mode="r", zarr_format=3)
-    packing = [codec["name"] for codec in array.metadata.to_dict()["codecs"]][1:-1]
+    codecs: Any = array.metadata.to_dict()["codecs"]
+    packing = [codec["name"] for codec in codecs][1:-1]
     store.packing = packing[0] if packing else None
     store.chunk_bytes = math.prod(array.chunks) * array.dtype.itemsize
     return array
