@@ -12,7 +12,9 @@ run that was cut off goes on where it stopped.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import errno
+import io
 import json
 import os
 import random
@@ -28,12 +30,11 @@ from pathlib import Path
 
 from relight_formats.header import dump
 from tests.faults import harness
-from tests.faults.children import Child, Result, calls, dies, fails
+from tests.faults.children import Child, Result, calls, dies, fails, one_thread
 from tests.faults.damage import HARMS, damage, files_of
 from tests.faults.stations import BY_NAME, OUT, STATIONS, Station, clear, content, make_workplace
 from tests.faults.sweep_in_forks import sweep
 
-ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 HANG = 60.0  # seconds; a command takes about one
 SIGNALS = {"SIGKILL": signal.SIGKILL, "SIGINT": signal.SIGINT, "SIGTERM": signal.SIGTERM}
 WAYS_OUT = ("--overwrite", "same command", "again", "delete it", "move it", "Wait for it to end", "another output")
@@ -71,8 +72,9 @@ class Campaign:
         os.chdir(self.place)
         handler = signal.getsignal(signal.SIGTERM)
         for station in self._with_sources():
-            if station.name != "tradeoff" and run([*station.command(), "--json"]) != 0:
-                raise SystemExit(f"{station.name}: fails undisturbed")
+            with contextlib.redirect_stdout(io.StringIO()):
+                if station.name != "tradeoff" and run([*station.command(), "--json"]) != 0:
+                    raise SystemExit(f"{station.name}: fails undisturbed")
             if station in self.stations:
                 clear(self.place)
                 result = self.child(station).finish(HANG)
@@ -620,10 +622,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    if missing := [name for name in ONE_THREAD if os.environ.get(name) != "1"]:
-        # Before NumPy loads: the threads of its libraries would be missing in forks, which then wait for them.
-        os.environ |= dict.fromkeys(missing, "1")
-        os.execv(sys.executable, [sys.executable, "-m", "tests.faults.campaign", *sys.argv[1:]])
+    one_thread("tests.faults.campaign")
     code = main()
     sys.stdout.flush()
     os._exit(code)

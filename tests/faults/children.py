@@ -10,7 +10,6 @@ from __future__ import annotations
 import atexit
 import contextlib
 import os
-import resource
 import signal
 import sys
 import tempfile
@@ -193,8 +192,9 @@ def calls(at: int, what: Callable[[], None]) -> Callable[[int, str, str], None]:
     return act
 
 
-def less_memory(limit: int) -> Callable[[], None]:
-    def apply() -> None:
-        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-
-    return apply
+def one_thread(module: str) -> None:
+    """Starts this program, a module, again unless NumPy's libraries have no threads: forks would wait for them."""
+    names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+    if missing := [name for name in names if os.environ.get(name) != "1"]:
+        os.environ |= dict.fromkeys(missing, "1")
+        os.execv(sys.executable, [sys.executable, "-m", module, *sys.argv[1:]])

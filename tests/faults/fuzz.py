@@ -32,6 +32,7 @@ from relight_formats.header import KEY, dump, write_root
 from relightcli.adapters.bvh import load_bvh
 from relightcli.adapters.images import encode_image, read_environment, read_image, read_texture
 from relightcli.adapters.meshes import load_mesh
+from relightcli.adapters.oiio import load_oiio
 from relightcli.adapters.ply import encode_ply
 from relightcli.adapters.rigs import load_rig
 from relightcli.errors import RelightError
@@ -42,12 +43,14 @@ from relightcli.stages.relight import Config, relight
 from relightcli.stages.shots import Shot, read_shots
 from tests.adapters.test_meshes import FACET, SMALL_GLTF, TRIANGLE_OFF, TRIANGLE_PLY, binary_stl
 from tests.core.transport.scenes import lambert, square
+from tests.faults.children import one_thread
 from tests.faults.damage import HARMS, harmed
 from tests.stages.pose_files import bar
 from tests.stages.scene_files import make_store, write_scene
 
 SECONDS = 2.0  # of computing, for one file
 MEMORY = 1 << 30  # beyond what the process has
+PATIENCE = 30.0  # seconds that a fork may be late
 SLICE = 200  # files from one fork
 TOKENS = (
     b"1e999",
@@ -331,8 +334,20 @@ def _slice(target: Target, folder: Path, seed: int, first: int, until: float, to
             break
 
 
+def _wait(pid: int, deadline: float) -> int:
+    """Exit status of a fork, which is killed when it is late: it waits for something that does not come."""
+    while True:
+        found, status = os.waitpid(pid, os.WNOHANG)
+        if found:
+            return status
+        if time.monotonic() > deadline:
+            os.kill(pid, signal.SIGKILL)
+        time.sleep(0.005)
+
+
 def fuzz(targets: list[Target], folder: Path, seed: int, seconds: float) -> tuple[dict[str, int], list[str]]:
     """Files per target, and the problems found. The targets share the time."""
+    load_oiio().attribute("exr_threads", -1)  # threads of a pool do not come along into a fork
     for target in targets:  # the valid files, so that forks find everything loaded
         for k, data in enumerate(target.seeds):
             path = folder / f"valid{k}{target.suffix}"
@@ -352,7 +367,7 @@ def fuzz(targets: list[Target], folder: Path, seed: int, seconds: float) -> tupl
                         os._exit(0)
                     finally:
                         os._exit(1)
-                _, status = os.waitpid(pid, 0)
+                status = _wait(pid, until + PATIENCE)
                 told.seek(0)
                 first, *lines = told.read().decode().splitlines()
                 problems += lines
@@ -382,4 +397,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
+    one_thread("tests.faults.fuzz")
     sys.exit(main())
