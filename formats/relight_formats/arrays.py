@@ -200,6 +200,7 @@ def read_layout(document: dict[str, Any], where: str) -> Layout:
     need(document.get("chunk_key_encoding") == encoding, "chunk_key_encoding", "'default' with separator '.'")
     allowed = [_codecs(dtype, codec) for codec in ("lz4", "zstd", "none")]
     need(document.get("codecs") in allowed, "codecs", "bytes, then nothing, blosc lz4 or zstd, then crc32c")
+    need(_fills(document.get("fill_value"), dtype), "fill_value", f"a value of {dtype}")
     need(document.get("storage_transformers", []) == [], "storage_transformers", "none")
     attributes = document.get("attributes")
     need(
@@ -208,6 +209,16 @@ def read_layout(document: dict[str, Any], where: str) -> Layout:
         "an object with 'units'",
     )
     return Layout(tuple(shape), tuple(chunks), dtype, tuple(dims))
+
+
+def _fills(value: Any, dtype: str) -> bool:
+    if dtype == "bool":
+        return isinstance(value, bool)
+    if dtype.startswith("float"):
+        return (type(value) in (int, float) and abs(value) <= 1e308) or value in ("NaN", "Infinity", "-Infinity")
+    bits = 8 * ITEM_BYTES[dtype]
+    low, high = (0, 2**bits) if dtype.startswith("u") else (-(2 ** (bits - 1)), 2 ** (bits - 1))
+    return type(value) is int and low <= value < high
 
 
 def _whole(value: Any, least: int) -> bool:
