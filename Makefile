@@ -1,9 +1,9 @@
-# make demo | tradeoff | test | lint | bench | recipes | clean. Each sets up what it needs in .venv.
+# make demo | tradeoff | test | lint | bench | recipes | faults | fuzz | clean. Each sets up what it needs in .venv.
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: demo tradeoff test lint bench recipes clean
+.PHONY: demo tradeoff test lint bench recipes faults fuzz clean
 
 $(VENV)/.base: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -44,6 +44,18 @@ recipes: $(VENV)/.base  ## every recipe end to end; each ends in a check
 	for r in recipes/*/Makefile; do \
 	  $(MAKE) --no-print-directory -C $$(dirname $$r) RELIGHTCLI=$(abspath $(BIN))/relightcli PYTHON=$(abspath $(BIN))/python OUT=$(abspath build/recipes)/$$(basename $$(dirname $$r)) || exit 1; \
 	done
+
+SEED ?= 0
+KILLS ?= 500
+CORRUPTIONS ?= 500
+OTHERS ?= 250
+MINUTES ?= 10
+
+faults: $(VENV)/.test  ## every command killed, starved and damaged; goes on where it stopped
+	$(BIN)/python -m tests.faults.campaign --kills $(KILLS) --corruptions $(CORRUPTIONS) --others $(OTHERS) --seed $(SEED) --results build/faults/seed-$(SEED).jsonl
+
+fuzz: $(VENV)/.test  ## files of strangers: every parser on mutated files
+	$(BIN)/python -m tests.faults.fuzz --minutes $(MINUTES) --seed $(SEED)
 
 clean:
 	rm -rf $(VENV) demo tradeoff build

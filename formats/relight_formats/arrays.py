@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeGuard
 
-from relight_formats.errors import StoreError
+from relight_formats.errors import AGAIN, StoreError
 from relight_formats.fingerprint import plain
 
 Codec = Literal["lz4", "zstd", "none"]
@@ -174,12 +174,12 @@ def read_layout(document: dict[str, Any], where: str) -> Layout:
 
     def need(condition: bool, key: str, expected: str) -> None:
         if not condition:
-            raise StoreError(f"{where}: {key}: expected {expected}, found {document.get(key)!r}; refused.")
+            raise StoreError(f"{where}: {key}: expected {expected}, found {document.get(key)!r}; refused. {AGAIN}")
 
     need(document.get("zarr_format") == 3 and document.get("node_type") == "array", "node_type", "a Zarr v3 array")
     unknown = sorted(document.keys() - _KEYS)
     if unknown:
-        raise StoreError(f"{where}: unknown keys {', '.join(unknown)}; refused.")
+        raise StoreError(f"{where}: unknown keys {', '.join(unknown)}; refused. {AGAIN}")
     shape, dims, dtype = document.get("shape"), document.get("dimension_names"), document.get("data_type")
     need(_whole(shape, 0), "shape", "a list of whole numbers")
     need(isinstance(dtype, str) and dtype in ITEM_BYTES, "data_type", f"one of {', '.join(ITEM_BYTES)}")
@@ -200,6 +200,7 @@ def read_layout(document: dict[str, Any], where: str) -> Layout:
     need(document.get("chunk_key_encoding") == encoding, "chunk_key_encoding", "'default' with separator '.'")
     allowed = [_codecs(dtype, codec) for codec in ("lz4", "zstd", "none")]
     need(document.get("codecs") in allowed, "codecs", "bytes, then nothing, blosc lz4 or zstd, then crc32c")
+    need(_fills(document.get("fill_value"), dtype), "fill_value", f"a value of {dtype}")
     need(document.get("storage_transformers", []) == [], "storage_transformers", "none")
     attributes = document.get("attributes")
     need(
@@ -208,6 +209,16 @@ def read_layout(document: dict[str, Any], where: str) -> Layout:
         "an object with 'units'",
     )
     return Layout(tuple(shape), tuple(chunks), dtype, tuple(dims))
+
+
+def _fills(value: Any, dtype: str) -> bool:
+    if dtype == "bool":
+        return isinstance(value, bool)
+    if dtype.startswith("float"):
+        return (type(value) in (int, float) and abs(value) <= 1e308) or value in ("NaN", "Infinity", "-Infinity")
+    bits = 8 * ITEM_BYTES[dtype]
+    low, high = (0, 2**bits) if dtype.startswith("u") else (-(2 ** (bits - 1)), 2 ** (bits - 1))
+    return type(value) is int and low <= value < high
 
 
 def _whole(value: Any, least: int) -> bool:

@@ -1,6 +1,7 @@
 """Zarr over a store's folder: every chunk written is durable, every chunk read has passed its checksum."""
 
 import asyncio
+import math
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from zarr.abc.store import ByteRequest
 from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
 from zarr.storage import LocalStore
 
-from relight_formats.errors import StoreError
+from relight_formats.errors import AGAIN, StoreError
 from relight_formats.files import write_durably
 
 
@@ -31,6 +32,24 @@ def chunk_problem(data: bytes) -> str | None:
     return None
 
 
+def unpacked_bytes(data: bytes, packing: str) -> int | None:
+    """Bytes that a packed chunk says it unpacks to, from its first bytes; None where it does not say.
+
+    packing: `blosc` (four bytes at 4, c-blosc 1) or `zstd` (Frame_Content_Size, RFC 8878 sec. 3.1.1.1).
+    """
+    if packing == "blosc":
+        return int.from_bytes(data[4:8], "little") if len(data) >= 16 else None
+    if len(data) < 6 or data[:4] != b"\x28\xb5\x2f\xfd":
+        return None
+    flags = data[4]
+    single = bool(flags & 0x20)
+    at = 5 + (not single) + (0, 1, 2, 4)[flags & 3]  # after the window and the dictionary's number
+    width = (int(single), 2, 4, 8)[flags >> 6]
+    if width == 0 or len(data) < at + width:
+        return None
+    return int.from_bytes(data[at : at + width], "little") + (256 if width == 2 else 0)
+
+
 class WrittenFolder(LocalStore):
     """For writing: a chunk's content is on disk when the assignment that wrote it returns (its name after the next
     `Writer.record`), and a crash leaves no half chunk under a chunk's name."""
@@ -45,6 +64,11 @@ class WrittenFolder(LocalStore):
 
 class CommittedFolder(LocalStore):
     """For reading a finished store: a chunk that is missing or does not match its checksum raises StoreError."""
+
+    packing: str | None = None
+    """How the chunks of the one array that is read are packed, and"""
+    chunk_bytes = 0
+    """what each of them unpacks to. Checked before a library allocates what a chunk asks for."""
 
     def __init__(self, root: Path | str, *, read_only: bool = True) -> None:
         super().__init__(root, read_only=True)
@@ -68,11 +92,12 @@ class CommittedFolder(LocalStore):
             problem: str | None = "is missing"
         else:
             problem = chunk_problem(data)
+            if problem is None and self.packing is not None:
+                unpacked = unpacked_bytes(data, self.packing)
+                if unpacked != self.chunk_bytes:
+                    problem = f"unpacks to {unpacked} bytes where {self.chunk_bytes} are expected"
         if problem:
-            raise StoreError(
-                f"{self.root}: array {array}: chunk file {path} {problem}; the store is damaged. "
-                f"Make it again (--overwrite)."
-            )
+            raise StoreError(f"{self.root}: array {array}: chunk file {path} {problem}; the store is damaged. {AGAIN}")
         return (prototype or default_buffer_prototype()).buffer.from_bytes(data)
 
 
@@ -85,5 +110,10 @@ def open_written(folder: Path, name: str) -> zarr.Array[Any]:
 
 def open_committed(folder: Path, name: str) -> zarr.Array[Any]:
     """An array of a finished store, for reading."""
-    array: zarr.Array[Any] = zarr.open_array(CommittedFolder(folder), path=name, mode="r", zarr_format=3)
+    store = CommittedFolder(folder)
+    array: zarr.Array[Any] = zarr.open_array(store, path=name, mode="r", zarr_format=3)
+    codecs: Any = array.metadata.to_dict()["codecs"]
+    packing = [codec["name"] for codec in codecs][1:-1]
+    store.packing = packing[0] if packing else None
+    store.chunk_bytes = math.prod(array.chunks) * array.dtype.itemsize
     return array

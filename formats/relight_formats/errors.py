@@ -7,3 +7,7 @@ class RelightError(Exception):
 
 class StoreError(RelightError):
     """A store that is damaged, incomplete for what was asked, of another version, locked, or made from other inputs."""
+
+
+AGAIN = "Make it again (--overwrite)."
+"""What to do about a damaged store."""

@@ -8,12 +8,15 @@ import json
 from pathlib import Path
 from typing import Any
 
-from relight_formats.errors import StoreError
+from relight_formats.errors import AGAIN, StoreError
 from relight_formats.files import write_durably
 from relight_formats.fingerprint import fingerprint_json
 
 FORMAT = 1
 """Version of the store format that this package writes and reads."""
+
+DOCUMENT_LIMIT = 256 << 20
+"""Largest metadata document, bytes: a ledger of half a million blocks."""
 
 ROOT = "zarr.json"
 KEY = "relight"
@@ -70,17 +73,22 @@ def write_root(folder: Path, header: dict[str, Any], attributes: dict[str, Any])
 def load_document(file: Path, store: Path) -> tuple[dict[str, Any], bytes]:
     """A JSON object and its bytes. Raises StoreError when it is missing or no JSON object, OSError when unreadable."""
     try:
-        content = file.read_bytes()
+        with open(file, "rb") as stream:
+            content = stream.read(DOCUMENT_LIMIT + 1)
     except (FileNotFoundError, NotADirectoryError):
-        raise StoreError(
-            f"{store}: {file.name} is missing at {file.parent}; the store is damaged, make it again."
-        ) from None
+        raise StoreError(f"{store}: {file.name} is missing at {file.parent}; the store is damaged. {AGAIN}") from None
+    if len(content) > DOCUMENT_LIMIT:
+        raise StoreError(f"{file}: expected at most {DOCUMENT_LIMIT >> 20} MiB of metadata, found more; refused.")
     try:
         document = json.loads(content)
     except (ValueError, RecursionError) as error:
-        raise StoreError(f"{file}: expected JSON, found something else ({error}); the store is damaged.") from None
+        raise StoreError(
+            f"{file}: expected JSON, found something else ({error}); the store is damaged. {AGAIN}"
+        ) from None
     if not isinstance(document, dict):
-        raise StoreError(f"{file}: expected a JSON object, found {type(document).__name__}; the store is damaged.")
+        raise StoreError(
+            f"{file}: expected a JSON object, found {type(document).__name__}; the store is damaged. {AGAIN}"
+        )
     return document, content
 
 
@@ -106,7 +114,10 @@ def read_root(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         found = "a file" if folder.exists() else "nothing"
         raise StoreError(f"{folder}: expected a relight store, found {found}.")
     if not (folder / ROOT).exists():
-        raise StoreError(f"{folder}: expected a relight store, found a folder without {ROOT}.")
+        raise StoreError(
+            f"{folder}: expected a relight store, found a folder without {ROOT}. If it was a store, move it away and "
+            f"make it again."
+        )
     document, _ = load_document(folder / ROOT, folder)
     attributes = document.get("attributes")
     header = attributes.get(KEY) if isinstance(attributes, dict) else None
@@ -122,13 +133,16 @@ def read_root(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     for key, kind in _FIELDS.items():
         if key not in header or not isinstance(header[key], kind):
             found = type(header[key]).__name__ if key in header else "nothing"
-            raise StoreError(f"{folder}: {ROOT}: relight.{key} has the wrong type ({found}); the store is damaged.")
+            raise StoreError(
+                f"{folder}: {ROOT}: relight.{key} has the wrong type ({found}); the store is damaged. {AGAIN}"
+            )
     if not all(isinstance(value, str) for value in header["inputs"].values()):
-        raise StoreError(f"{folder}: {ROOT}: relight.inputs must map names to fingerprints; the store is damaged.")
+        raise StoreError(
+            f"{folder}: {ROOT}: relight.inputs must map names to fingerprints; the store is damaged. {AGAIN}"
+        )
     if header["digest"] != _digest(document):
         raise StoreError(
-            f"{folder}: {ROOT} does not match its digest: it was changed or damaged after it was written. "
-            f"Make the store again (--overwrite)."
+            f"{folder}: {ROOT} does not match its digest: it was changed or damaged after it was written. {AGAIN}"
         )
     return header, {key: value for key, value in document["attributes"].items() if key != KEY}
 

@@ -14,6 +14,10 @@ from relight_formats.files import write_durably
 from relight_formats.fingerprint import canonical_json
 
 FILE_NAME = "ledger.jsonl"
+"""The finished blocks."""
+
+DOCUMENTS = "documents.jsonl"
+"""The fingerprints of the arrays' metadata, in the same form: `id` is the array's name."""
 
 
 def _encode(block: dict[str, Any]) -> bytes:

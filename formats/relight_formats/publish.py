@@ -12,13 +12,13 @@ from typing import Any
 from relight_formats.errors import StoreError
 from relight_formats.files import REPLACED, fsync_folder, remove_store, sibling
 from relight_formats.header import is_store, read_root
-from relight_formats.ledger import FILE_NAME
+from relight_formats.ledger import DOCUMENTS, FILE_NAME
+from relight_formats.store import need_whole
 
 
 def publish(path: Path, partial: Path) -> None:
     """Give a sealed store its final name, replacing the one that may be there."""
-    with contextlib.suppress(FileNotFoundError):
-        os.unlink(partial / FILE_NAME)
+    _drop_notes(partial)
     replaced = sibling(path, REPLACED)
     if path.exists():
         if not is_store(path):
@@ -31,10 +31,11 @@ def publish(path: Path, partial: Path) -> None:
         remove_store(replaced)
 
 
-def discard(path: Path, partial: Path) -> None:
-    """Delete unfinished work. One rename first: half of a deleted store is never taken up as unfinished work."""
+def discard(path: Path, folder: Path) -> None:
+    """Delete unfinished work on `path`, or the store at `path` itself. One rename first: half of a deleted store is
+    never taken for a whole one."""
     replaced = sibling(path, REPLACED)
-    os.rename(partial, replaced)
+    os.rename(folder, replaced)
     remove_store(replaced)
 
 
@@ -42,17 +43,19 @@ def tidy(path: Path, partial: Path) -> bool:
     """Finish what a crash interrupted; whether a sealed store took its final name by that. Needs the writer's lock.
 
     Raises:
-        StoreError: `NAME.replaced` is in the way and is no relight store.
+        StoreError: `NAME.replaced` is in the way and is no relight store; a sealed store was damaged since.
     """
     replaced = sibling(path, REPLACED)
     if replaced.exists():
         _need_ours(replaced)
-        if path.exists() or sealed(partial) or not sealed(replaced):
+        if path.exists() or sealed(partial) or not _whole(replaced):
             remove_store(replaced)
         else:
             os.rename(replaced, path)
     if not sealed(partial):
         return False
+    _drop_notes(partial)
+    need_whole(partial)
     publish(path, partial)
     return True
 
@@ -64,6 +67,22 @@ def sealed(folder: Path) -> bool:
     except StoreError:
         return False
     return header["complete"] is True
+
+
+def _whole(folder: Path) -> bool:
+    """Whether a store is all there: a crash may have come while it was being deleted."""
+    try:
+        need_whole(folder)
+    except StoreError:
+        return False
+    return sealed(folder)
+
+
+def _drop_notes(partial: Path) -> None:
+    """A sealed store holds in itself what they say."""
+    for name in (FILE_NAME, DOCUMENTS):
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(partial / name)
 
 
 def _need_ours(folder: Path) -> None:

@@ -11,7 +11,7 @@ from relight_formats.files import LOCK, REPLACED, UNFINISHED, local_path, siblin
 from relight_formats.fingerprint import plain
 from relight_formats.header import CONVENTIONS, FORMAT, ROOT, is_store, mismatch, read_root, write_root
 from relight_formats.lock import Lock
-from relight_formats.publish import discard, tidy
+from relight_formats.publish import discard, sealed, tidy
 from relight_formats.writer import Status, Writer
 
 
@@ -61,12 +61,12 @@ def begin(
         "content": None,
     }
     if not overwrite and _finished(final, header):
-        _tidy_beside(final, partial)
+        _tidy_beside(final, partial, header)
         return None
     _need_replaceable(final)
     lock = Lock(final)
     try:
-        published = tidy(final, partial)
+        published = _tidy(final, partial, overwrite)
         # Either another writer committed just before the lock was ours, or the run that this one repeats had died
         # between its commit mark and the final name.
         if (published and _same(final, header)) or (not overwrite and _finished(final, header)):
@@ -78,13 +78,27 @@ def begin(
         raise
 
 
-def _tidy_beside(final: Path, partial: Path) -> None:
-    """Clear what a crash just after the final rename left. Not worth failing for, nor waiting for another writer."""
-    if sibling(final, REPLACED).exists() or sibling(final, LOCK).exists():
+def _tidy(final: Path, partial: Path, overwrite: bool) -> bool:
+    try:
+        return tidy(final, partial)
+    except StoreError:
+        # A sealed store that was damaged before it took its name; anything else is in the way still.
+        if not overwrite or not sealed(partial):
+            raise
+        discard(final, partial)
+        return tidy(final, partial)
+
+
+def _tidy_beside(final: Path, partial: Path, header: dict[str, Any]) -> None:
+    """Clear what a crash just after the final rename left, and work on a second store like the one that is there.
+    Not worth failing for, nor waiting for another writer."""
+    if any(sibling(final, suffix).exists() for suffix in (REPLACED, LOCK, UNFINISHED)):
         with contextlib.suppress(StoreError, OSError):
             lock = Lock(final)
             try:
                 tidy(final, partial)
+                if partial.exists() and not mismatch(read_root(partial)[0], header, with_program=False):
+                    discard(final, partial)
             finally:
                 lock.release()
 
@@ -133,13 +147,12 @@ def _take_up(final: Path, partial: Path, header: dict[str, Any], lock: Lock, ove
                     f"{partial}: unfinished work is there, made with others: {'; '.join(different)}. "
                     f"Repeat the command that began it, or use --overwrite to start afresh."
                 )
+            sweep_unfinished(partial)
+            return Writer(final, partial, found, attributes, lock, Status.RESUMED)
         except StoreError:
             if not overwrite:
                 raise
             discard(final, partial)
-        else:
-            sweep_unfinished(partial)
-            return Writer(final, partial, found, attributes, lock, Status.RESUMED)
     partial.mkdir(exist_ok=True)
     sweep_unfinished(partial)
     write_root(partial, header, {})

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from relight_formats.arrays import Layout, read_layout
-from relight_formats.errors import StoreError
+from relight_formats.errors import AGAIN, StoreError
 from relight_formats.files import UNFINISHED, local_path, sibling, tree_bytes, walk
 from relight_formats.fingerprint import fingerprint_bytes
 from relight_formats.header import ROOT, load_document, read_root
@@ -81,8 +81,7 @@ class Store:
             return np.asarray(array[...])
         except (ValueError, RuntimeError, TypeError) as error:
             raise StoreError(
-                f"{self.path}: array {name}: a chunk passes its checksum and cannot be decoded ({error}). "
-                f"Make the store again (--overwrite)."
+                f"{self.path}: array {name}: a chunk passes its checksum and cannot be decoded ({error}). {AGAIN}"
             ) from error
 
     def sizes(self) -> dict[str, ArraySize]:
@@ -135,6 +134,15 @@ def open_store(path: str | os.PathLike[str], kind: str | None = None) -> Store:
     )
 
 
+def need_whole(folder: Path) -> None:
+    """Reads all of a sealed store. Raises StoreError for the first thing that is not as it was committed."""
+    header, _ = read_root(folder)
+    ledger = _load_ledger(folder, header["ledger"])
+    problems = verify(folder, _load_layouts(folder, ledger), ledger)
+    if problems:
+        raise StoreError(f"{problems[0]} {AGAIN}")
+
+
 def _absent(folder: Path) -> str:
     partial = sibling(folder, UNFINISHED)
     if not partial.exists():
@@ -145,9 +153,7 @@ def _absent(folder: Path) -> str:
 def _load_ledger(folder: Path, fingerprint: str | None) -> dict[str, Any]:
     document, content = load_document(folder / LEDGER_GROUP / ROOT, folder)
     if fingerprint_bytes(content) != fingerprint:
-        raise StoreError(
-            f"{folder}: {LEDGER_GROUP}/{ROOT} does not match its digest; the store is damaged. Make it again."
-        )
+        raise StoreError(f"{folder}: {LEDGER_GROUP}/{ROOT} does not match its digest; the store is damaged. {AGAIN}")
     ledger = document.get("attributes")
     if (
         not isinstance(ledger, dict)
@@ -161,7 +167,7 @@ def _load_ledger(folder: Path, fingerprint: str | None) -> dict[str, Any]:
         )
     ):
         raise StoreError(
-            f"{folder}: {LEDGER_GROUP}/{ROOT}: expected blocks, documents and arrays; the store is damaged."
+            f"{folder}: {LEDGER_GROUP}/{ROOT}: expected blocks, documents and arrays; the store is damaged. {AGAIN}"
         )
     return ledger
 
@@ -171,17 +177,17 @@ def _load_layouts(folder: Path, ledger: dict[str, Any]) -> dict[str, Layout]:
     for relative, fingerprint in ledger["documents"].items():
         parts = relative.split("/")
         if ".." in parts or parts[0] == "" or parts[-1] != ROOT:
-            raise StoreError(f"{folder}: the ledger names {relative!r}, which is no metadata of this store; refused.")
+            raise StoreError(
+                f"{folder}: the ledger names {relative!r}, which is no metadata of this store; refused. {AGAIN}"
+            )
         document, content = load_document(folder / relative, folder)
         if fingerprint_bytes(content) != fingerprint:
-            raise StoreError(f"{folder}: {relative} does not match its digest; the store is damaged. Make it again.")
+            raise StoreError(f"{folder}: {relative} does not match its digest; the store is damaged. {AGAIN}")
         if document.get("node_type") == "array":
             name = relative.rpartition("/")[0]
             layouts[name] = read_layout(document, f"{folder}: array {name}")
     if layouts.keys() != ledger["arrays"].keys():
-        raise StoreError(
-            f"{folder}: the ledger's arrays are not those of the store; the store is damaged. Make it again."
-        )
+        raise StoreError(f"{folder}: the ledger's arrays are not those of the store; the store is damaged. {AGAIN}")
     return layouts
 
 

@@ -12,17 +12,18 @@ import numpy as np
 from relight_formats.arrays import CHUNK_BYTES, Codec, Layout, array_metadata, check_name, read_layout
 from relight_formats.errors import StoreError
 from relight_formats.files import fsync_folder, local_path, sweep_unfinished, walk, write_durably
-from relight_formats.fingerprint import plain
+from relight_formats.fingerprint import fingerprint_bytes, plain
 from relight_formats.header import KEY, ROOT, dump, load_document, write_root
-from relight_formats.ledger import FILE_NAME, LedgerFile
+from relight_formats.ledger import DOCUMENTS, FILE_NAME, LedgerFile, read_ledger
 from relight_formats.lock import Lock
 from relight_formats.publish import publish
-from relight_formats.seal import seal
+from relight_formats.seal import LEDGER_GROUP, seal
 
 if TYPE_CHECKING:
     import zarr
 
 _GROUP = dump({"zarr_format": 3, "node_type": "group", "attributes": {}})
+_START_AGAIN = "Start again with --overwrite."
 
 
 class Status(enum.Enum):
@@ -51,15 +52,10 @@ class Writer:
         self._header = header
         self._attributes = attributes
         self._lock = lock
-        self._ledger = LedgerFile(partial / FILE_NAME)
         self._synced: dict[str, int] = {}
-        self._layouts: dict[str, Layout] = {}
-        for relative, entry in walk(partial):
-            if entry.name == ROOT and relative != ROOT:
-                document, _ = load_document(Path(entry.path), partial)
-                if document.get("node_type") == "array":
-                    name = relative.rpartition("/")[0]
-                    self._layouts[name] = read_layout(document, f"{partial}: array {name}")
+        self._layouts: dict[str, Layout] = check_unfinished(partial)
+        self._ledger = LedgerFile(partial / FILE_NAME)
+        self._documents = LedgerFile(partial / DOCUMENTS)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -143,13 +139,16 @@ class Writer:
         if name in self._layouts:
             found = (folder / ROOT).read_bytes()
             if found != content:
+                self._spoil()
                 raise StoreError(
                     f"{self.partial_path}: array {name}: the interrupted run made it with another shape, type, chunks, "
-                    f"codec or attributes than this one. Start again with --overwrite."
+                    f"codec or attributes than this one. {_START_AGAIN}"
                 )
         else:
             self._make_groups(name)
             folder.mkdir(exist_ok=True)
+            # Noted first: a document that is there and not as noted is a damaged one.
+            self._documents.append({"id": name, "document": fingerprint_bytes(content)})
             write_durably(folder / ROOT, content)
             fsync_folder(folder.parent)
             self._layouts[name] = layout
@@ -260,10 +259,23 @@ class Writer:
         """
         self._need_open()
         sweep_unfinished(self.partial_path)
+        for name in self._layouts:
+            self._make_groups(name)  # unless something has deleted them, they are there
         self._sync_folders()
         self._header = {**self._header, "summary": plain(summary, "summary")}
-        seal(self.partial_path, self._header, self._attributes, self._ledger.blocks)
+        try:
+            lost = sorted({note["id"] for note in self._documents.blocks} - self._layouts.keys())
+            if lost:
+                raise StoreError(
+                    f"{self.partial_path}: array {lost[0]}: its {ROOT}, which an interrupted run wrote, is missing. "
+                    f"{_START_AGAIN}"
+                )
+            seal(self.partial_path, self._header, self._attributes, self._ledger.blocks)
+        except StoreError:
+            self._spoil()
+            raise
         self._ledger.close()
+        self._documents.close()
         publish(self.path, self.partial_path)
         self.status = Status.DONE
         self._lock.release()
@@ -271,7 +283,12 @@ class Writer:
     def close(self) -> None:
         """Keep the unfinished work and let go of the lock. Harmless when repeated and after `commit`."""
         self._ledger.close()
+        self._documents.close()
         self._lock.release()
+
+    def _spoil(self) -> None:
+        """No rerun takes up this work any more, for it would fail again; with `--overwrite` one starts afresh."""
+        write_root(self.partial_path, {**self._header, "kind": "damaged"}, self._attributes)
 
     def _need_open(self) -> None:
         if self._lock.released:
@@ -284,6 +301,33 @@ class Writer:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.close()
+
+
+def check_unfinished(partial: Path) -> dict[str, Layout]:
+    """Layouts of the arrays of unfinished work, all of which is read: metadata against its notes, chunks against their
+    checksums. Raises StoreError for whatever is not as it was written; what is missing shows at commit."""
+    from relight_formats.chunks import chunk_problem, is_chunk
+
+    noted: dict[str, Any] = {}
+    for note in read_ledger(partial / DOCUMENTS)[0]:
+        noted[note["id"]] = note.get("document")
+    layouts = {}
+    for relative, entry in walk(partial):
+        folder = relative.rpartition("/")[0]
+        if entry.is_dir(follow_symlinks=False) or folder in ("", LEDGER_GROUP):
+            continue
+        problem = None
+        if entry.name == ROOT:
+            document, content = load_document(Path(entry.path), partial)
+            if document.get("node_type") == "array":
+                layouts[folder] = read_layout(document, f"{partial}: array {folder}")
+            if content != _GROUP and fingerprint_bytes(content) != noted.get(folder):
+                problem = "is not as it was written"
+        elif is_chunk(relative):
+            problem = chunk_problem(Path(entry.path).read_bytes())
+        if problem:
+            raise StoreError(f"{partial}: {relative} {problem}; the unfinished work is damaged. {_START_AGAIN}")
+    return layouts
 
 
 def worker_array(partial_path: str | Path, name: str) -> "zarr.Array[Any]":

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import glob
 import os
 import stat
+from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 from relightcli.errors import InputError
 
@@ -23,7 +27,8 @@ def need_output(path: str | Path) -> None:
 def write_atomic(path: str | Path, data: bytes) -> None:
     """Put `data` at `path` in one step, so that a reader or a crash never sees half a file.
 
-    A symbolic link keeps pointing at its target. A device or a pipe is written to directly.
+    A symbolic link keeps pointing at its target. A device or a pipe is written to directly. What writers of `path`
+    left that were killed amid this (`.NAME.PID.partial`) is removed.
     Raises InputError if the folder is missing or `path` is a folder; OSError (disk full, no permission) as it comes.
     """
     target = Path(os.path.realpath(path))
@@ -36,14 +41,38 @@ def write_atomic(path: str | Path, data: bytes) -> None:
         if target.exists() and not stat.S_ISREG(target.stat().st_mode):
             target.write_bytes(data)
             return
-        with open(temporary, "wb") as stream:
+        with _locked(temporary) as stream:
             stream.write(data)
             stream.flush()
             os.fsync(stream.fileno())
-        os.replace(temporary, target)
+            os.replace(temporary, target)
+        _sweep(target)
     except BaseException as error:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
         if isinstance(error, OSError):  # a full disk names no file, the others the temporary one
             error.filename, error.filename2 = str(path), None
         raise
+
+
+@contextlib.contextmanager
+def _locked(temporary: Path) -> Iterator[BinaryIO]:
+    """A new file, locked while its writer lives. A file system without locks keeps what killed writers leave."""
+    while True:
+        with open(temporary, "wb") as stream:
+            with contextlib.suppress(OSError):
+                fcntl.flock(stream.fileno(), fcntl.LOCK_EX)
+            if os.fstat(stream.fileno()).st_nlink:  # else another writer swept it away before it was locked
+                yield stream
+                return
+
+
+def _sweep(target: Path) -> None:
+    """Removes temporary files of `target` that no living process has locked."""
+    for left in target.parent.glob(f".{glob.escape(target.name)}.*.partial"):
+        if not left.name[len(target.name) + 2 : -len(".partial")].isdigit():
+            continue
+        # Opened for writing, because a lock on a network file system asks for that.
+        with contextlib.suppress(OSError), open(left, "r+b") as stream:
+            fcntl.flock(stream.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+            left.unlink()

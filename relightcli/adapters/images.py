@@ -131,6 +131,13 @@ class _Raw:
 
 
 def _read(path: Path) -> _Raw:
+    try:
+        return _read_decoded(path)
+    except UnicodeDecodeError:  # the library's message quotes the file
+        raise InputError(f"{path}: cannot be read as a picture (its header is damaged).") from None
+
+
+def _read_decoded(path: Path) -> _Raw:
     oiio = load_oiio()
     if not path.exists():
         raise InputError(f"{path}: no such file; expected a picture.")
@@ -171,7 +178,7 @@ def _read(path: Path) -> _Raw:
         if space and not space.startswith("srgb"):
             notes.append(f"{path.name}: is marked {space}; decoded as sRGB.")
     primaries = spec.getattribute("chromaticities")
-    if primaries is not None and not np.allclose(primaries, REC709, atol=1e-3):
+    if primaries is not None and (np.shape(primaries) != (8,) or not np.allclose(primaries, REC709, atol=1e-3)):
         notes.append(f"{path.name}: its primaries are not Rec.709; its values were taken as they are.")
 
     metadata = {a.name: a.value for a in spec.extra_attribs if isinstance(a.value, str | int | float | tuple)}

@@ -43,8 +43,12 @@ def add_motions(rig: Rig, spec: ObjectSpec) -> Rig:
 
 def load_joint_map(path: Path, rig: Rig) -> dict[str, str]:
     """The table `[joints]` of a TOML file: the rig's nodes, and which captured joint moves each. Raises InputError."""
+    with open(path, "rb") as file:
+        content = file.read(MAX_BYTES + 1)
+    if len(content) > MAX_BYTES:
+        raise InputError(f"{path}: expected at most {MAX_BYTES:,} bytes for a joint map; found more.")
     try:
-        data = tomllib.loads(path.read_bytes()[:MAX_BYTES].decode("utf-8-sig"))
+        data = tomllib.loads(content.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: is not valid TOML: {error}.") from None
     unknown = ", ".join(key for key in data if key != "joints")

@@ -156,8 +156,6 @@ def _need_bounces(lighting: LightingStore) -> None:
 def copy_arrays(store: formats.Store, writer: formats.Writer, names: list[str]) -> None:
     """Copies arrays as they are, a range of chunks at a time."""
     for name in names:
-        if f"copy/{name}" in writer.done:
-            continue
         source: Any = store.array(name)
         layout = store.layouts[name]
         attributes = dict(source.attrs)
@@ -172,6 +170,8 @@ def copy_arrays(store: formats.Store, writer: formats.Writer, names: list[str]) 
             attrs=attributes,
             codec="zstd" if any(c["name"] == "zstd" for c in source.metadata.to_dict()["codecs"]) else "lz4",
         )
+        if f"copy/{name}" in writer.done:
+            continue
         step = max(1, layout.chunks[0]) if layout.shape else 1
         for start in range(0, layout.shape[0] if layout.shape else 1, step):
             rows = slice(start, start + step) if layout.shape else ...

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from relightcli.core.transport.receivers import receivers_of_vertices
 from relightcli.errors import InputError, StoreError
 from relightcli.scene.describe import scene_from_json
 from relightcli.scene.model import Geometry, Material, Scene
+from relightcli.stages.precompute_config import BASES, MOST_BOUNCES
 from relightcli.stages.rig_store import read_rigs
 
 if TYPE_CHECKING:
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
 
 IN_MEMORY = 1 << 30  # visibility up to this size stays in memory between frames
 ENTRIES = 1 << 23  # of pixels' gathers that are made at a time
+MOST_RESOLUTION = 4096  # that a store may name: it decides how much memory is asked for
 KINDS = ("transfer", "clusters", "asset", "light_clusters", "pose")
 BLACK = (0.0, 0.0, 0.0)
 
@@ -103,6 +106,18 @@ def need_still(store: formats.Store) -> None:
         )
 
 
+@contextlib.contextmanager
+def described(path: Path) -> Iterator[None]:
+    """A store whose files are sound, but which does not describe what its kind has to: StoreError."""
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
+        what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
+        raise StoreError(
+            f"{path}: its metadata do not describe a store of its kind ({what[:200]}). Make it again (--overwrite)."
+        ) from error
+
+
 class LightingStore:
     """An open transfer store. Reads what it needs when it needs it; keeps small visibility in memory."""
 
@@ -113,6 +128,10 @@ class LightingStore:
                 f"{self.store.path}: expected a store of kind {' or '.join(KINDS)}, found {self.store.kind}."
             )
         self.threads = threads
+        with described(self.store.path):
+            self._open()
+
+    def _open(self) -> None:
         self.scene, self.geometry = read_scene(self.store)
         read: Any = self.store.read
         self.position: NDArray[np.float64] = read("receivers/position")
@@ -120,9 +139,13 @@ class LightingStore:
         self.object: NDArray[np.int32] = read("receivers/object")
         self.side: NDArray[np.int8] = read("receivers/side")
         self.vertex: NDArray[np.int32] | None = read("receivers/vertex") if "receivers/vertex" in self.store else None
-        self.resolution = int(self.store.settings["light_resolution"])
+        self.resolution = self._whole("light_resolution", 1, MOST_RESOLUTION)
         self.basis: str = self.store.settings["basis"]
-        self.bounces = int(self.store.settings["bounces"])
+        if self.basis not in BASES:
+            raise ValueError(f"settings.basis: expected one of {', '.join(BASES)}, found {self.basis!r}")
+        self.bounces = self._whole("bounces", 0, MOST_BOUNCES)
+        if not isinstance(self.store.settings["receivers"], str):
+            raise TypeError("settings.receivers: expected a text")
         # Receivers of pixels, which come first; those on vertices, if any, follow.
         self.pixels = self.store.layouts["receivers/pixel"].shape[0] if "receivers/pixel" in self.store else 0
         self._gathered: dict[int, Gather] = {}
@@ -134,6 +157,13 @@ class LightingStore:
             if layout.raw_bytes <= IN_MEMORY:  # decoded beside the making of the first view
                 self._bits = ThreadPoolExecutor(1).submit(read, "visibility/bits")
             self._chunk = layout.chunks[0]
+
+    def _whole(self, name: str, low: int, high: int) -> int:
+        """A setting of the store, which may be a stranger's."""
+        value = self.store.settings[name]
+        if type(value) is not int or not low <= value <= high:
+            raise ValueError(f"settings.{name}: expected {low} to {high}, found {value!r}")
+        return value
 
     def __len__(self) -> int:
         return len(self.position)

@@ -15,7 +15,7 @@ from relightcli.scene.build import scene_to_json
 from relightcli.scene.model import Geometry
 from relightcli.stages.dry_run import dry_run
 from relightcli.stages.fields import describe, put_fields
-from relightcli.stages.inputs import scene_inputs
+from relightcli.stages.inputs import need_unchanged, scene_inputs
 from relightcli.stages.pose_job import simulate_poses
 from relightcli.stages.precompute_config import Config
 from relightcli.stages.prepare import Prepared, prepare
@@ -35,12 +35,14 @@ def precompute(config: Config) -> dict[str, Any]:
     prepared = prepare(config)
     if config.dry_run:
         return dry_run(prepared)
-    scene, source, geometry, moving = prepared.scene, prepared.source, prepared.geometry, prepared.moving
+    inputs = scene_inputs(scene := prepared.scene)
+    need_unchanged(prepared.read)
+    source, geometry, moving = prepared.source, prepared.geometry, prepared.moving
     writer = formats.begin(
         config.output,
         KIND,
         settings=_settings(prepared),
-        inputs=scene_inputs(scene),
+        inputs=inputs,
         program=f"relightcli {__version__}",
         overwrite=config.overwrite,
     )

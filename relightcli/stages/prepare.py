@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from relightcli.scene.build import build_geometry
 from relightcli.scene.model import Geometry, Scene
 from relightcli.scene.parse import load_scene
 from relightcli.stages.fields import Moving, add_points, find_movers, place, without
+from relightcli.stages.inputs import named_files, stamps
 from relightcli.stages.precompute_config import RESOLUTION, Config, check_bounces, check_config
 from relightcli.stages.promise import try_resolutions
 from relightcli.stages.receiver_setup import (
@@ -56,6 +58,7 @@ class Prepared:
     resolution: int = RESOLUTION
     tried: tuple[tuple[int, pilot.Share], ...] = ()  # resolutions, each with its error
     planning_seconds: float = 0.0
+    read: dict[Path, tuple[int, int, int]] = field(default_factory=dict)  # `stamps` of the scene's files before that
 
     @property
     def simulated(self) -> list[str]:
@@ -113,7 +116,9 @@ def prepare(config: Config) -> Prepared:
     asked = effects.parse_effects(config.effects)
     wanted = effects.bounces_asked(asked, config.bounces)
     promise = config.tolerance if config.basis == "visibility" else None
+    read = stamps([config.scene.absolute()])
     scene = load_scene(config.scene, allow_outside=config.allow_outside)
+    read |= stamps(named_files(scene) - read.keys())
     motions: dict[str, str] = {o.name: o.motion for o in scene.objects.values()}
     source = build_geometry(scene)
     both = _both_sides(scene, source)
@@ -169,6 +174,7 @@ def prepare(config: Config) -> Prepared:
         promise,
         config.light_resolution or RESOLUTION,
         planning_seconds=planning,
+        read=read,
     )
     if config.light_resolution is None and promise is not None and shadows:
         receivers, buried, _ = prepared.receivers()

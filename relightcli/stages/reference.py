@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import relight_formats as formats
-from relight_formats.files import remove_store
+from relight_formats.publish import discard
 from relightcli import __version__
 from relightcli.adapters import images
 from relightcli.adapters.rays import Tracer
@@ -205,7 +205,7 @@ def render_reference(config: Config, shots: list[Shot], suffix: str, started: fl
         if shot.poses:
             metadata["relight:pose"] = " ".join(shot.poses)
         written.append(put_picture(config, shot, suffix, pixels, extra, metadata))
-        remove_store(samples)
+        discard(samples, samples)
     return {
         "store": str(config.store),
         "output": written if config.frames else written[0],

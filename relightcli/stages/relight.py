@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import relight_formats as formats
-from relightcli.stages.lighting import LightingStore
+from relightcli.stages.lighting import LightingStore, described
 from relightcli.stages.outputs import (
     Config,
     check,
@@ -82,6 +82,11 @@ def relight(config: Config) -> dict[str, Any]:
 def open_lighting(path: Path, threads: int) -> LightingStore:
     """The store of any stage that pictures are made from."""
     store = formats.open_store(path)
+    with described(store.path):
+        return _of_kind(store, threads)
+
+
+def _of_kind(store: formats.Store, threads: int) -> LightingStore:
     if "fields" in store.attrs and store.kind == "pose":
         from relightcli.stages.posed_moving import PosedMovingStore
 

@@ -39,6 +39,7 @@ from relightcli.scene.posing import parse_pose
 from relightcli.scene.settings import measured_fit
 
 MOST_FRAMES = 100_000
+MOST_BYTES = 16 << 20
 STEPPED = ("env", "camera")
 NUMBERS = ("env_rotate", "exposure")
 
@@ -214,7 +215,10 @@ def _between(
 def _load(path: Path) -> dict[str, Any]:
     try:
         with open(path, "rb") as file:
-            return tomllib.load(file)
+            content = file.read(MOST_BYTES + 1)
+        if len(content) > MOST_BYTES:
+            raise InputError(f"{path}: expected at most {MOST_BYTES:,} bytes for a file of keyframes; found more")
+        return tomllib.loads(content.decode("utf-8"))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; expected a file of keyframes for --frames") from None
     except IsADirectoryError:

@@ -300,3 +300,12 @@ def test_a_link_keeps_pointing_at_its_target(tmp_path):
     write_image(tmp_path / "link.exr", np.ones((2, 2, 3)))
     assert (tmp_path / "link.exr").is_symlink()
     assert read_image(tmp_path / "real.exr").pixels.shape == (2, 2, 3)
+
+
+def test_primaries_of_another_kind(tmp_path):
+    """Eight numbers are expected; a header may hold anything under that name."""
+    spec = oiio.ImageSpec(4, 2, 3, oiio.FLOAT)
+    spec.attribute("chromaticities", oiio.TypeDesc("float[3]"), (1.0, 2.0, 3.0))
+    buffer = oiio.ImageBuf(spec)
+    assert buffer.write(str(tmp_path / "a.exr"))
+    assert "primaries are not Rec.709" in read_image(tmp_path / "a.exr").notes[0]

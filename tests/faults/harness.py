@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import hashlib
+import json
 import os
 import resource
 import signal
@@ -165,3 +166,29 @@ def limit_file_size(limit: int):
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
     return apply
+
+
+def rewrite_header(store: Path, **changes: object) -> None:
+    """Change fields of a store's header, with a digest that fits: as another program would have written it."""
+    from relight_formats.header import KEY, write_root
+
+    attributes = json.loads((store / "zarr.json").read_text())["attributes"]
+    header = {**attributes.pop(KEY), **changes}
+    write_root(store, header, attributes)
+
+
+def mount_small(folder: Path, size: int) -> None:
+    """For a child process: a disk of `size` bytes of its own at `folder`. Where that is refused it ends with 98."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.unshare(0x00020000) != 0:  # CLONE_NEWNS
+        os._exit(98)
+    if libc.mount(b"none", b"/", None, (1 << 18) | (1 << 14), None) != 0:  # MS_PRIVATE | MS_REC
+        os._exit(98)
+    if libc.mount(b"tmpfs", bytes(folder), b"tmpfs", 0, f"size={size}".encode()) != 0:
+        os._exit(98)
+
+
+def grow(folder: Path, size: int) -> None:
+    """The same disk with more room."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    assert libc.mount(b"tmpfs", bytes(folder), b"tmpfs", 32, f"size={size}".encode()) == 0  # MS_REMOUNT

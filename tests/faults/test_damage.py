@@ -9,6 +9,7 @@ import shutil
 import pytest
 
 from relightcli.cli.main import run
+from relightcli.stages import prepare
 from tests.faults import harness
 
 RELIGHT = ("relight", "t.zarr", "-o", "out.exr", "-q")
@@ -178,6 +179,25 @@ def test_an_input_changed_while_work_was_interrupted(folder, changed):
     assert code == 3
     assert f"unfinished work is there, made with others: input {changed}" in stderr
     assert not (folder / "t.zarr").exists()
+
+
+@pytest.mark.parametrize("changed", ["scene.toml", "ball.obj"])
+def test_an_input_changed_while_it_was_read(folder, monkeypatch, capsys, changed):
+    """What was read and the fingerprint of what is there now do not belong together: nothing is begun."""
+    known = prepare.build_geometry
+
+    def build(scene):
+        geometry = known(scene)
+        with open(folder / changed, "a") as file:
+            file.write("# changed\n")
+        return geometry
+
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(prepare, "build_geometry", build)
+    code, stderr = call(capsys, *harness.PRECOMPUTE, "-o", "u.zarr")
+    assert code == 2
+    assert f"{changed}: was changed while it was read" in stderr
+    assert [p.name for p in folder.iterdir() if p.name.startswith("u.zarr")] == []
 
 
 def test_what_is_no_store_is_never_touched(here, capsys):

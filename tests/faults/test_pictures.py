@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import random
 import time
 
 import pytest
 
+from relightcli.adapters.files import write_atomic
 from tests.faults import harness
 
 FRAMES = "format = 1\nframes = 6\n[[key]]\nframe = 1\nenv_rotate = 0\n[[key]]\nframe = 7\nenv_rotate = 360\n"
@@ -37,6 +39,19 @@ def test_killed_while_writing_a_sequence(finished, pattern):
             (finished / name).write_bytes(b"old")
             found.append(data == expected[name])
     assert any(found)  # else every kill came before the first frame
+
+
+def test_what_killed_writers_left_goes_with_the_next_picture(tmp_path):
+    """Their temporary files, but none that a living writer has locked, and nothing of other names."""
+    left, held, others = tmp_path / ".a.exr.1.partial", tmp_path / ".a.exr.2.partial", tmp_path / ".a.exr.b.partial"
+    for path in (left, held, others):
+        path.write_bytes(b"half")
+    with open(held, "rb") as living:
+        fcntl.flock(living.fileno(), fcntl.LOCK_EX)
+        write_atomic(tmp_path / "a.exr", b"whole")
+    assert sorted(p.name for p in tmp_path.iterdir()) == [held.name, others.name, "a.exr"]
+    write_atomic(tmp_path / "a.exr", b"whole")
+    assert sorted(p.name for p in tmp_path.iterdir()) == [others.name, "a.exr"]
 
 
 def test_two_relights_at_once(finished):

@@ -51,7 +51,7 @@ def test_death_at_every_change_of_the_file_system(tmp_path: Path, scenario: str)
     if scenario == "fresh":
         # After the commit mark there is nothing left to do but to give the name, and nothing is computed again.
         marked = [crash["after_crash"] for crash in crashes if not crash["worked"]]
-        assert marked.count("absent") == 2  # at the removal of the ledger file, and at the rename
+        assert marked.count("absent") == 3  # at the removal of the ledger and of the notes, and at the rename
         assert marked.count("factor 2") >= 1
 
 
