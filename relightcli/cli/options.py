@@ -33,6 +33,21 @@ def workers(command: Command) -> Command:
     )(command)
 
 
+def scheduler(command: Command) -> Command:
+    return click.option(
+        "--scheduler",
+        default=None,
+        metavar="ADDRESS",
+        help="Dask scheduler, e.g. tcp://host:8786, whose workers run the blocks instead of local processes.",
+    )(command)
+
+
+def note_no_blocks(result: dict[str, Any], scheduler: str | None) -> None:
+    """Tells the user that there was nothing for a scheduler to do."""
+    if scheduler is not None:
+        result["notes"].append("--scheduler: this work is not made of blocks; it is done here, in --workers threads")
+
+
 def overwrite(command: Command) -> Command:
     return click.option("--overwrite", is_flag=True, help="Replace a store made from other inputs or settings.")(
         command

@@ -60,6 +60,7 @@ class Config:
     camera: str | None = None
     seed: int = 0
     workers: int = 1
+    scheduler: str | None = None
     overwrite: bool = False
     dry_run: bool = False
     quiet: bool = False
@@ -70,6 +71,7 @@ def cluster_lights(config: Config) -> dict[str, Any]:
     started = time.perf_counter()
     epsilon = _check(config)
     need_output(config.output)
+    run.need_scheduler(None if config.dry_run else config.scheduler)
     lighting = LightingStore(config.store, config.workers)
     need_still(lighting.store)
     if lighting.store.kind != "transfer":
@@ -138,6 +140,7 @@ def cluster_lights(config: Config) -> dict[str, Any]:
             workers=config.workers,
             label="clusters",
             quiet=config.quiet,
+            scheduler=config.scheduler,
         )
         if "check" not in writer.done:
             writer.record("check", job.open().check(leaves, config.seed))
@@ -275,6 +278,7 @@ def _refine(job: ClusterJob, writer: formats.Writer, config: Config) -> list[Cel
         workers=config.workers,
         label="light",
         quiet=config.quiet,
+        scheduler=config.scheduler,
     )
     for block in writer.blocks:
         if block["id"].startswith("refine/"):
