@@ -23,6 +23,7 @@ NAMES = (
     "sh_transfer",
     "sky_matrix",
     "store",
+    "scheduler",
     "accuracy",
     "interreflections",
     "brdf",
