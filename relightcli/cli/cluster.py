@@ -11,7 +11,7 @@ from relightcli.cli import options
 
 
 @click.command(name="cluster")
-@click.argument("store", type=options.PATH)
+@click.argument("store", type=options.store_path)
 @options.output("Clusters store to make, e.g. clusters.zarr.")
 @click.option(
     "--clusters", default=None, type=click.IntRange(1, 1 << 20), help="Groups of receivers. Default: one per 1000."

@@ -11,7 +11,7 @@ from relightcli.cli import options
 
 
 @click.command(name="factorize")
-@click.argument("store", type=options.PATH)
+@click.argument("store", type=options.store_path)
 @options.output("Asset to make, e.g. asset.zarr.")
 @click.option(
     "--eigenvectors",

@@ -11,7 +11,7 @@ from relightcli.cli import options
 
 
 @click.command(name="fit-pose")
-@click.argument("store", type=options.PATH)
+@click.argument("store", type=options.store_path)
 @options.output("Pose store to make, e.g. pose.zarr.")
 @click.option(
     "--model",

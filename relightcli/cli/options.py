@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 import click
 
@@ -14,6 +15,31 @@ Command = Callable[..., Any]
 SEED = click.IntRange(0, 2**63 - 1)
 # What may not be read is a system error (5), not bad usage (2); the stages say so.
 PATH = click.Path(path_type=Path, readable=False)
+
+
+class Url(type(Path())):  # type: ignore[misc]
+    """A URL that goes through the stages as a path does: no file of this machine, and spelled as it was given."""
+
+    def __new__(cls, url: str) -> Url:
+        self: Url = super().__new__(cls, url)
+        self._url = url
+        return self
+
+    def __str__(self) -> str:
+        return str(getattr(self, "_url", None) or super().__str__())
+
+    def __fspath__(self) -> str:
+        return str(self)
+
+    def __reduce__(self) -> tuple[type[Url], tuple[str]]:
+        return Url, (str(self),)
+
+
+def store_path(value: str) -> Path:
+    """A store: a path, or a URL."""
+    if value.startswith("file://"):
+        return Path(unquote(urlsplit(value).path))
+    return Url(value) if "://" in value else Path(value)
 
 
 def available_cores() -> int:
@@ -24,7 +50,7 @@ def available_cores() -> int:
 
 
 def output(help: str) -> Callable[[Command], Command]:
-    return click.option("-o", "--output", required=True, type=PATH, help=help)
+    return click.option("-o", "--output", required=True, type=store_path, help=help)
 
 
 def workers(command: Command) -> Command:

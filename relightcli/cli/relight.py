@@ -11,7 +11,7 @@ from relightcli.cli import options
 
 
 @click.command(name="relight")
-@click.argument("store", type=options.PATH)
+@click.argument("store", type=options.store_path)
 @click.option(
     "-o",
     "--output",

@@ -96,6 +96,8 @@ def heatmap_range(error: NDArray[np.float64], metric: str) -> float:
 
 
 def _kind(path: Path) -> str:
+    if "://" in str(path):  # pictures are read from files only
+        return "store"
     if "#" in path.name and not path.exists():
         return "sequence"
     if path.is_dir():

@@ -76,7 +76,8 @@ class _Coats:
 def read_scene(store: formats.Store) -> tuple[Scene, Geometry]:
     """The scene that a transfer store was made from, as the store keeps it."""
     read: Any = store.read
-    scene = scene_from_json(store.attrs["scene"], folder=store.path.parent)
+    folder = store.path.parent if isinstance(store.path, Path) else None  # maps are read from files only
+    scene = scene_from_json(store.attrs["scene"], folder=folder)
     textures = {int(name.split("/")[1]): read(name) for name in store.names() if name.startswith("textures/")}
     geometry = Geometry(
         tuple(scene.objects),
