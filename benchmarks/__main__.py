@@ -24,6 +24,7 @@ NAMES = (
     "sky_matrix",
     "store",
     "scheduler",
+    "growth",
     "accuracy",
     "interreflections",
     "brdf",

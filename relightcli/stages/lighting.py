@@ -191,9 +191,11 @@ class LightingStore:
         buried: NDArray[np.bool_] = found
         return buried
 
-    def blocks(self, first: int = 0, last: int | None = None) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
+    def blocks(
+        self, first: int = 0, last: int | None = None, needed: NDArray[np.bool_] | None = None
+    ) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
         """Visibility bits in ranges of the receivers from `first` to `last`: all at once if they are in memory, else
-        chunk by chunk."""
+        chunk by chunk, of which those without any receiver `needed` (N,) are not read."""
         last = len(self) if last is None else last
         if self._bits is not None:
             yield slice(first, last), self._bits.result()[first:last]
@@ -201,16 +203,23 @@ class LightingStore:
         array: Any = self.store.array("visibility/bits")
         for start in range(first - first % self._chunk, last, self._chunk):
             rows = slice(max(start, first), min(start + self._chunk, last))
-            yield rows, np.asarray(array[rows])
+            if needed is None or needed[rows].any():
+                yield rows, np.asarray(array[rows])
 
     def bits_of(self, receivers: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
         """Visibility bits of some receivers, rising indices."""
         parts = []
-        for block, bits in self.blocks():
+        for block, bits in self.blocks(needed=self._mask(receivers)):
             own = receivers[(receivers >= block.start) & (receivers < block.stop)]
             if len(own):
                 parts.append(bits[own - block.start])
         return np.concatenate(parts)
+
+    def _mask(self, receivers: NDArray[np.integer[Any]]) -> NDArray[np.bool_]:
+        """Which receivers are among those, (N,)."""
+        mask = np.zeros(len(self), bool)
+        mask[receivers] = True
+        return mask
 
     def exit_radiance(
         self,
@@ -298,7 +307,7 @@ class LightingStore:
         """Specular light of the sky at `rows`, integrated from the bits, (N, 3); 0 elsewhere."""
         specular = np.zeros((len(self), 3), np.float32)
         tree = sky_tree(splat(sky), environment, rotate)
-        for block, bits in self.blocks():
+        for block, bits in self.blocks(needed=self._mask(rows)):
             pick = rows[(rows >= block.start) & (rows < block.stop)]
             if len(pick):
                 specular[pick] = specular_radiance(
@@ -479,8 +488,8 @@ class LightingStore:
     def _irradiance(self, sky: SkyCube, active: NDArray[np.bool_] | None, basis: str) -> NDArray[np.float32]:
         if basis == "visibility":
             prefix = moment_prefix(splat(sky))
-            out = np.empty((len(self), 3), np.float32)
-            for rows, bits in self.blocks():
+            out = np.zeros((len(self), 3), np.float32)
+            for rows, bits in self.blocks(needed=active):
                 mask = None if active is None else active[rows]
                 out[rows] = irradiance(bits, self.normal[rows], prefix, self.threads, mask)
             return out
