@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Hashable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping, Set
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -54,7 +54,7 @@ class Job(Hashable, Protocol):
 
 class Ledger(Protocol):
     @property
-    def done(self) -> frozenset[str]: ...
+    def done(self) -> Set[str]: ...
 
     def record(self, block_id: str, info: dict[str, Any]) -> None: ...
 
