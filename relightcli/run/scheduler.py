@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 ANSWER = 10.0  # seconds in which a scheduler has to answer
-EMPTY = 60.0  # seconds that a cluster may be without any worker
+EMPTY = 60.0  # seconds that a cluster may be without any worker; one that grows by need begins so
 LEAVE = 30.0  # seconds that blocks in progress get to end, when a run is given up
 POLL = 1.0  # seconds between looks at the cluster while no block ends
 KEPT = "what is finished is kept: run the same command again to continue"
@@ -40,7 +40,6 @@ def run_on_cluster(
     """
     token = uuid.uuid4().hex
     with connected(address) as client:
-        _need_workers(client, address)
         keys = [f"relightcli-{block.id}-{token}" for block in todo]
         futures: dict[str, tuple[Block, Future[Info]]] = {}
         try:
@@ -103,18 +102,6 @@ def connected(address: str) -> Iterator[Client]:
             client.status = "closed"
 
 
-def _need_workers(client: Client, address: str) -> None:
-    try:
-        client.wait_for_workers(1, timeout=ANSWER)
-    except TimeoutError:
-        raise SystemFault(
-            f"--scheduler {address}: the cluster has no workers; expected at least one, as `dask worker {address}` "
-            "starts it"
-        ) from None
-    except (OSError, RuntimeError) as error:
-        raise _lost(address) from error
-
-
 def _last_seen(client: Client, address: str, last: float) -> float:
     """Now, if the cluster has any worker. Raises SystemFault where it has had none for too long."""
     try:
@@ -124,7 +111,10 @@ def _last_seen(client: Client, address: str, last: float) -> float:
     if workers:
         return time.monotonic()
     if time.monotonic() - last > EMPTY:
-        raise SystemFault(f"--scheduler {address}: the cluster has had no workers for {EMPTY:.0f} s; {KEPT}")
+        raise SystemFault(
+            f"--scheduler {address}: the cluster has had no workers for {EMPTY:.0f} s; expected at least one, as "
+            f"`dask worker {address}` starts it; {KEPT}"
+        )
     return last
 
 

@@ -110,8 +110,8 @@ def test_workers_that_keep_dying_and_a_cluster_without_any(tmp_path, cluster, mo
         run(Dying(str(tmp_path), 1, once=False), ledger, blocks, cluster.address)
     assert exit_code(caught.value)[0] == SYSTEM
     assert blocks[1].id not in ledger.done
-    monkeypatch.setattr(scheduler, "ANSWER", 0.5)
-    with pytest.raises(SystemFault, match="has no workers"):
+    monkeypatch.setattr(scheduler, "EMPTY", 0.5)
+    with pytest.raises(SystemFault, match="has had no workers"):
         run(Counting(str(tmp_path)), FileLedger(tmp_path), blocks, cluster.address)
 
 
