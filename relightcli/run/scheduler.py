@@ -7,6 +7,7 @@ the same bytes again. A worker does one block at a time, whatever its threads: w
 from __future__ import annotations
 
 import contextlib
+import gc
 import logging
 import threading
 import time
@@ -16,7 +17,7 @@ from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING
 
 from relightcli import __version__
-from relightcli.errors import InputError, StoreError, SystemFault
+from relightcli.errors import InputError, RelightError, StoreError, SystemFault
 from relightcli.run.blocks import Block, Info, Job, run_one
 
 if TYPE_CHECKING:
@@ -84,15 +85,19 @@ def connected(address: str) -> Iterator[Client]:
     # What matters reaches the user as an error of this program.
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
+    failure: RelightError | None = None
     try:
         client = distributed.Client(address, timeout=ANSWER, set_as_default=False)
     except (OSError, TimeoutError):
-        raise SystemFault(
+        failure = SystemFault(
             f"--scheduler {address}: no Dask scheduler answers there; expected one that runs, as `dask scheduler` "
             "starts it"
-        ) from None
+        )
     except (ValueError, TypeError, KeyError) as error:
-        raise InputError(f"--scheduler {address}: expected an address such as tcp://host:8786; {error}") from None
+        failure = InputError(f"--scheduler {address}: expected an address such as tcp://host:8786; {error}")
+    if failure is not None:
+        gc.collect()  # what is left of the client closes now, not amid the start of the next, which it would block
+        raise failure
     try:
         yield client
     finally:
@@ -148,6 +153,8 @@ def _lost(address: str) -> SystemFault:
 
 def _give_up(client: Client, futures: list[Future[Info]], token: str) -> None:
     """Takes back what has not begun, and waits for the blocks in progress: after this nothing of the run is written."""
+    if client.status != "running":  # without their scheduler workers end, too
+        return
     with contextlib.suppress(Exception):  # of a scheduler or workers that have died
         client.cancel(futures, force=True)
         deadline = time.monotonic() + LEAVE
