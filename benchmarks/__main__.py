@@ -23,6 +23,8 @@ NAMES = (
     "sh_transfer",
     "sky_matrix",
     "store",
+    "scheduler",
+    "growth",
     "accuracy",
     "interreflections",
     "brdf",

@@ -1,6 +1,7 @@
-"""Writing and reading the visibility bits through the store, against raw files.
+"""Writing and reading the visibility bits through the store, against raw files; and what other codecs would give.
 
-Both sides are made durable (fsync) when written; both are read while the system still has the file in memory.
+Both sides are made durable (fsync) when written; both are read while the system still has the file in memory. Codecs
+are timed in memory, in CPU seconds of one thread, on chunks as the store has them.
 """
 
 from __future__ import annotations
@@ -15,11 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.report import Report, Row
+from benchmarks.asset import metal_scene, offline
+from benchmarks.report import Report, Row, Table
 from benchmarks.scenes import Setting, main_store, write_scene
 
 BLOCK = 1024  # receivers in a chunk at R = 64
 REPEATS = 3
+MOST_CHUNKS = 8  # of an array that codecs are tried on
+LARGEST = 6  # arrays of a store that codecs are tried on
 
 
 def write_store(path: Path, bits: NDArray[np.uint8]) -> None:
@@ -46,6 +50,53 @@ def write_raw(path: Path, bits: NDArray[np.uint8]) -> None:
     with path.open("wb") as file:
         bits.tofile(file)
         os.fsync(file.fileno())
+
+
+def codecs() -> dict[str, Any]:
+    """What is tried; the format has lz4 (blosc, level 5, byte shuffle) and zstd (level 3)."""
+    from numcodecs import Blosc, Zstd
+
+    return {
+        "lz4": Blosc("lz4", 5, Blosc.SHUFFLE),
+        "zstd": Zstd(3),
+        "zstd 1": Zstd(1),
+        "zstd 9": Zstd(9),
+        "blosc lz4, bits": Blosc("lz4", 5, Blosc.BITSHUFFLE),
+        "blosc zstd 3, bytes": Blosc("zstd", 3, Blosc.SHUFFLE),
+        "blosc zstd 3, bits": Blosc("zstd", 3, Blosc.BITSHUFFLE),
+    }
+
+
+def codec_rows(path: Path) -> list[tuple[str, str, float, float, float, float]]:
+    """For the largest arrays of a store and each codec: bytes of the values, how many times smaller, MB/s of values
+    compressed and decompressed."""
+    from numcodecs import blosc
+
+    import relight_formats as formats
+
+    blosc.use_threads = False
+    store = formats.open_store(path)
+    sizes = store.sizes()
+    rows = []
+    for name in sorted(store.names(), key=lambda n: -sizes[n].stored)[:LARGEST]:
+        layout, array = store.layouts[name], store.array(name)
+        starts = range(0, layout.shape[0], layout.chunks[0])
+        starts = starts[:: max(1, len(starts) // MOST_CHUNKS)]
+        parts: list[Any] = [np.ascontiguousarray(array[a : a + layout.chunks[0]]) for a in starts]
+        raw = sum(part.nbytes for part in parts)
+        for label, codec in codecs().items():
+            seconds = [0.0, 0.0]
+            clock = time.thread_time()
+            packed = [codec.encode(part) for part in parts]
+            seconds[0] = time.thread_time() - clock
+            clock = time.thread_time()
+            for data in packed:
+                codec.decode(data)
+            seconds[1] = time.thread_time() - clock
+            speed = [raw / 1e6 / max(s, 1e-9) for s in seconds]
+            what = f"{name} ({layout.data_type})"
+            rows.append((what, label, sizes[name].raw / 1e6, raw / sum(map(len, packed)), *speed))
+    return rows
 
 
 def measure(setting: Setting) -> Report:
@@ -75,4 +126,12 @@ def measure(setting: Setting) -> Report:
         report.rows.append(Row(name, speed[name], "MB/s", f"raw file: {peer:,.0f} MB/s", speed[name] / peer))
     size = f"raw bits: {bits.nbytes / len(bits):,.0f} bytes"
     report.rows.append(Row("stored", stored / len(bits), "bytes a receiver", size, bits.nbytes / stored))
+    metal, _ = metal_scene(setting)
+    folder = setting.work / "codecs"
+    folder.mkdir()
+    offline(metal, folder, setting.options)
+    head = ("array", "codec", "MB of values", "times smaller", "compressed, MB/s", "decompressed, MB/s")
+    for kind in ("transfer", "asset"):
+        rows = codec_rows(folder / f"{kind}.zarr")
+        report.tables.append(Table(f"codecs: the largest arrays of a {kind} store with two bounces", head, tuple(rows)))
     return report

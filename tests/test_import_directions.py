@@ -18,7 +18,7 @@ ALLOWED = {
     "cli": {"cli", "stages", "errors", "__version__"},
     "stages": {"stages", "plan", "run", "scene", "adapters", "core", "errors", "relight_formats", "__version__"},
     "plan": {"plan", "core", "scene.model", "errors"},
-    "run": {"run", "errors"},
+    "run": {"run", "errors", "__version__"},
     "scene": {"scene", "adapters", "core", "errors"},
     "adapters": {"adapters", "core", "errors"},
     "core": {"core", "scene.model", "errors"},

@@ -28,7 +28,10 @@ def local_path(path: str | os.PathLike[str]) -> Path:
     """The real, absolute path of a store. Raises StoreError for a URL."""
     text = os.fspath(path)
     if "://" in text:
-        raise StoreError(f"{text}: stores are read and written as local folders; expected a path, found a URL.")
+        raise StoreError(
+            f"{text}: stores are written to folders, which take their names by a rename; expected a path, found a URL. "
+            "Copy the finished store there: it can be read from a URL."
+        )
     return Path(os.path.realpath(text))
 
 

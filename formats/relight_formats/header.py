@@ -11,6 +11,7 @@ from typing import Any
 from relight_formats.errors import AGAIN, StoreError
 from relight_formats.files import write_durably
 from relight_formats.fingerprint import fingerprint_json
+from relight_formats.remote import Place, RemotePath
 
 FORMAT = 1
 """Version of the store format that this package writes and reads."""
@@ -70,11 +71,14 @@ def write_root(folder: Path, header: dict[str, Any], attributes: dict[str, Any])
     write_durably(folder / ROOT, dump(document))
 
 
-def load_document(file: Path, store: Path) -> tuple[dict[str, Any], bytes]:
+def load_document(file: Place, store: Place) -> tuple[dict[str, Any], bytes]:
     """A JSON object and its bytes. Raises StoreError when it is missing or no JSON object, OSError when unreadable."""
     try:
-        with open(file, "rb") as stream:
-            content = stream.read(DOCUMENT_LIMIT + 1)
+        if isinstance(file, RemotePath):
+            content = file.head(DOCUMENT_LIMIT + 1)
+        else:
+            with open(file, "rb") as stream:
+                content = stream.read(DOCUMENT_LIMIT + 1)
     except (FileNotFoundError, NotADirectoryError):
         raise StoreError(f"{store}: {file.name} is missing at {file.parent}; the store is damaged. {AGAIN}") from None
     if len(content) > DOCUMENT_LIMIT:
@@ -102,7 +106,7 @@ def is_store(folder: Path) -> bool:
     return isinstance(attributes, dict) and isinstance(attributes.get(KEY), dict) and "format" in attributes[KEY]
 
 
-def read_root(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+def read_root(folder: Place) -> tuple[dict[str, Any], dict[str, Any]]:
     """The header and the user's attributes of a store, finished or not.
 
     Raises:

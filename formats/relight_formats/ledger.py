@@ -55,13 +55,14 @@ def read_ledger(path: Path) -> tuple[list[dict[str, Any]], bool]:
 
 
 class LedgerFile:
-    """An open ledger. `blocks` is what it holds; `append` adds to both, durably."""
+    """An open ledger. `blocks` is what it holds, `ids` by name; `append` adds to all, durably."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.blocks, sound = read_ledger(path)
         if not sound:  # appending after a torn line would tear the next one too
             write_durably(path, b"".join(map(_encode, self.blocks)))
+        self.ids = dict.fromkeys(block["id"] for block in self.blocks)
         self._descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
 
     def append(self, block: dict[str, Any]) -> None:
@@ -77,6 +78,7 @@ class LedgerFile:
             os.ftruncate(self._descriptor, size)
             raise
         self.blocks.append(block)
+        self.ids[block["id"]] = None
 
     def close(self) -> None:
         if self._descriptor >= 0:

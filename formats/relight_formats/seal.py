@@ -10,11 +10,12 @@ from relight_formats.errors import StoreError
 from relight_formats.files import fsync_folder, walk, write_durably
 from relight_formats.fingerprint import fingerprint_bytes, fingerprint_json
 from relight_formats.header import ROOT, dump, load_document, write_root
+from relight_formats.remote import Place, RemotePath
 
 LEDGER_GROUP = "ledger"
 
 
-def chunk_digest(folder: Path, layout: Layout) -> tuple[str, int, list[str]]:
+def chunk_digest(folder: Place, layout: Layout) -> tuple[str, int, list[str]]:
     """SHA-256 over name, size and checksum of an array's chunk files in grid order; their bytes; the missing ones.
 
     Only the last four bytes of each file are read: its CRC-32C.
@@ -24,16 +25,22 @@ def chunk_digest(folder: Path, layout: Layout) -> tuple[str, int, list[str]]:
     missing = []
     for name in layout.chunk_names():
         try:
-            with open(folder / name, "rb") as file:
-                size = file.seek(0, os.SEEK_END)
-                file.seek(max(0, size - 4))
-                checksum = file.read(4)
+            size, checksum = _size_and_end(folder / name)
         except FileNotFoundError:
             missing.append(name)
             continue
         digest.update(f"{name} {size} {checksum.hex()}\n".encode("ascii"))
         total += size
     return "sha256:" + digest.hexdigest(), total, missing
+
+
+def _size_and_end(file: Place) -> tuple[int, bytes]:
+    if isinstance(file, RemotePath):
+        return file.size_and_end(4)
+    with open(file, "rb") as opened:
+        size = opened.seek(0, os.SEEK_END)
+        opened.seek(max(0, size - 4))
+        return size, opened.read(4)
 
 
 def content_fingerprint(

@@ -13,6 +13,7 @@ from relight_formats.files import UNFINISHED, local_path, sibling, tree_bytes, w
 from relight_formats.fingerprint import fingerprint_bytes
 from relight_formats.header import ROOT, load_document, read_root
 from relight_formats.ledger import FILE_NAME, read_ledger
+from relight_formats.remote import Place, RemotePath, place
 from relight_formats.seal import LEDGER_GROUP
 from relight_formats.verify import verify
 
@@ -33,7 +34,7 @@ class ArraySize:
 class Store:
     """A committed store. Made by `open_store`; nothing in it can be changed."""
 
-    path: Path
+    path: Place
     kind: str
     settings: dict[str, Any]
     inputs: dict[str, str]
@@ -98,7 +99,7 @@ def open_store(path: str | os.PathLike[str], kind: str | None = None) -> Store:
     """Open a finished store for reading. All metadata is checked, no array is read.
 
     Args:
-        path: folder of the store.
+        path: folder of the store, or a URL that fsspec can open (`s3://bucket/store.zarr`).
         kind: the kind that is needed; None takes any.
 
     Raises:
@@ -106,7 +107,7 @@ def open_store(path: str | os.PathLike[str], kind: str | None = None) -> Store:
             codecs or data types outside the format, a symbolic link inside.
         OSError: no permission.
     """
-    folder = local_path(path)
+    folder = place(path)
     if not folder.exists():
         raise StoreError(f"{folder}: {_absent(folder)}")
     header, attributes = read_root(folder)
@@ -114,9 +115,8 @@ def open_store(path: str | os.PathLike[str], kind: str | None = None) -> Store:
         raise StoreError(f"{folder}: this store is unfinished. Run the command that makes it again; it continues.")
     if kind is not None and header["kind"] != kind:
         raise StoreError(f"{folder}: expected a store of kind {kind}, found {header['kind']}.")
-    for relative, entry in walk(folder):
-        if entry.is_symlink():
-            raise StoreError(f"{folder}: {relative} is a symbolic link; a store holds files and folders only. Refused.")
+    if isinstance(folder, Path):
+        _need_no_links(folder)
     ledger = _load_ledger(folder, header["ledger"])
     return Store(
         path=folder,
@@ -143,14 +143,20 @@ def need_whole(folder: Path) -> None:
         raise StoreError(f"{problems[0]} {AGAIN}")
 
 
-def _absent(folder: Path) -> str:
-    partial = sibling(folder, UNFINISHED)
+def _need_no_links(folder: Path) -> None:
+    for relative, entry in walk(folder):
+        if entry.is_symlink():
+            raise StoreError(f"{folder}: {relative} is a symbolic link; a store holds files and folders only. Refused.")
+
+
+def _absent(folder: Place) -> str:
+    partial = folder.with_name(folder.name + UNFINISHED)
     if not partial.exists():
         return "expected a relight store, found nothing."
     return f"this store is unfinished; {partial.name} is there. Run the command that makes it again; it continues."
 
 
-def _load_ledger(folder: Path, fingerprint: str | None) -> dict[str, Any]:
+def _load_ledger(folder: Place, fingerprint: str | None) -> dict[str, Any]:
     document, content = load_document(folder / LEDGER_GROUP / ROOT, folder)
     if fingerprint_bytes(content) != fingerprint:
         raise StoreError(f"{folder}: {LEDGER_GROUP}/{ROOT} does not match its digest; the store is damaged. {AGAIN}")
@@ -172,8 +178,10 @@ def _load_ledger(folder: Path, fingerprint: str | None) -> dict[str, Any]:
     return ledger
 
 
-def _load_layouts(folder: Path, ledger: dict[str, Any]) -> dict[str, Layout]:
+def _load_layouts(folder: Place, ledger: dict[str, Any]) -> dict[str, Layout]:
     layouts = {}
+    if isinstance(folder, RemotePath):
+        folder.fetch(list(ledger["documents"]))
     for relative, fingerprint in ledger["documents"].items():
         parts = relative.split("/")
         if ".." in parts or parts[0] == "" or parts[-1] != ROOT:

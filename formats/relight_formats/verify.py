@@ -8,10 +8,11 @@ from relight_formats.arrays import Layout
 from relight_formats.errors import StoreError
 from relight_formats.files import walk
 from relight_formats.header import ROOT, dump, load_document
+from relight_formats.remote import Place
 from relight_formats.seal import LEDGER_GROUP, chunk_digest
 
 
-def verify(folder: Path, layouts: dict[str, Layout], ledger: dict[str, Any]) -> list[str]:
+def verify(folder: Place, layouts: dict[str, Layout], ledger: dict[str, Any]) -> list[str]:
     """Problems of a store whose metadata passed `open_store`, one or two sentences each.
 
     Every chunk is read, checked against its checksum and decoded. Missing and additional files are named; so are chunks
@@ -21,7 +22,10 @@ def verify(folder: Path, layouts: dict[str, Layout], ledger: dict[str, Any]) -> 
     document, content = load_document(folder / ROOT, folder)
     if content != dump(document):
         problems.append(f"{folder}: {ROOT} is not spelled as it was written.")
-    present = {relative for relative, entry in walk(folder) if not entry.is_dir(follow_symlinks=False)}
+    if isinstance(folder, Path):
+        present = {relative for relative, entry in walk(folder) if not entry.is_dir(follow_symlinks=False)}
+    else:
+        present = folder.files()
     expected = {ROOT, f"{LEDGER_GROUP}/{ROOT}", *ledger["documents"]}
     for name, layout in sorted(layouts.items()):
         found, chunks = _array_problems(folder, name, layout, present, ledger["arrays"][name])
@@ -31,7 +35,7 @@ def verify(folder: Path, layouts: dict[str, Layout], ledger: dict[str, Any]) -> 
 
 
 def _array_problems(
-    folder: Path, name: str, layout: Layout, present: set[str], entry: dict[str, Any]
+    folder: Place, name: str, layout: Layout, present: set[str], entry: dict[str, Any]
 ) -> tuple[list[str], set[str]]:
     """Problems of one array, and those files in `present` that are chunks of it."""
     from relight_formats.chunks import open_committed

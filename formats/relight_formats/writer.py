@@ -2,7 +2,7 @@
 
 import enum
 import os
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
@@ -78,9 +78,9 @@ class Writer:
         return np.asarray(worker_array(self.partial_path, name)[...])
 
     @property
-    def done(self) -> frozenset[str]:
-        """Ids of the blocks whose results are on disk."""
-        return frozenset(block["id"] for block in self._ledger.blocks)
+    def done(self) -> Set[str]:
+        """Ids of the blocks whose results are on disk: a view, which grows with them."""
+        return self._ledger.ids.keys()
 
     @property
     def blocks(self) -> list[dict[str, Any]]:

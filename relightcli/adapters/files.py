@@ -16,6 +16,8 @@ from relightcli.errors import InputError
 
 def need_output(path: str | Path) -> None:
     """Refuse an output that cannot be made, before work goes into it. Raises InputError."""
+    if "://" in str(path):
+        raise InputError(f"--output {path}: expected a path; what is finished can be copied to a URL, and read there")
     target = Path(os.path.realpath(path))
     if not str(path) or not target.name:
         raise InputError(f"--output {str(path)!r}: expected the name of a file or store to write")

@@ -11,7 +11,7 @@ from relightcli.cli import options
 
 
 @click.command(name="cluster")
-@click.argument("store", type=options.PATH)
+@click.argument("store", type=options.store_path)
 @options.output("Clusters store to make, e.g. clusters.zarr.")
 @click.option(
     "--clusters", default=None, type=click.IntRange(1, 1 << 20), help="Groups of receivers. Default: one per 1000."
@@ -59,10 +59,18 @@ from relightcli.cli import options
 @click.option("--seed", default=0, type=options.SEED, show_default=True, help="Seed of samples and first centres.")
 @click.option("--dry-run", is_flag=True, help="Say what would be made; do nothing.")
 @options.workers
+@options.scheduler
 @options.overwrite
 @options.report
 def command(
-    store: Path, output: Path, workers: int | None, verbose: bool, quiet: bool, as_json: bool, **settings: Any
+    store: Path,
+    output: Path,
+    workers: int | None,
+    scheduler: str | None,
+    verbose: bool,
+    quiet: bool,
+    as_json: bool,
+    **settings: Any,
 ) -> None:
     """Group the receivers of the transfer store STORE and find a basis for their light; or, with --light-resolution
     and for stores of direct light, group the lights of the sky."""
@@ -75,10 +83,13 @@ def command(
         from relightcli.stages.light_clusters import Config as LightConfig
         from relightcli.stages.light_clusters import cluster_lights
 
-        options.tell(result := cluster_lights(LightConfig(**common, **asked)), _light_text(result), as_json, quiet)
+        result = cluster_lights(LightConfig(**common, **asked, scheduler=scheduler))
+        options.tell(result, _light_text(result), as_json, quiet)
         return
     of_receivers: dict[str, Any] = {name: settings[name] for name in ("clusters", "tolerance", "functions")}
-    options.tell(result := cluster(Config(**common, **of_receivers)), _text(result), as_json, quiet)
+    result = cluster(Config(**common, **of_receivers))
+    options.note_no_blocks(result, scheduler)
+    options.tell(result, "\n".join([*(f"note: {note}" for note in result["notes"]), _text(result)]), as_json, quiet)
 
 
 OF_LIGHTS = ("resolution", "epsilon", "criterion", "lights", "seconds", "camera")

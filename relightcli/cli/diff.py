@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 
 @click.command("diff")
-@click.argument("a", type=options.PATH)
-@click.argument("b", type=options.PATH)
+@click.argument("a", type=options.store_path)
+@click.argument("b", type=options.store_path)
 @click.option(
     "--metric",
     "metrics",

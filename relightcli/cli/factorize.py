@@ -11,7 +11,7 @@ from relightcli.cli import options
 
 
 @click.command(name="factorize")
-@click.argument("store", type=options.PATH)
+@click.argument("store", type=options.store_path)
 @options.output("Asset to make, e.g. asset.zarr.")
 @click.option(
     "--eigenvectors",
@@ -39,10 +39,18 @@ from relightcli.cli import options
 )
 @click.option("--dry-run", is_flag=True, help="Say what would be made; do nothing.")
 @options.workers
+@options.scheduler
 @options.overwrite
 @options.report
 def command(
-    store: Path, output: Path, workers: int | None, verbose: bool, quiet: bool, as_json: bool, **settings: Any
+    store: Path,
+    output: Path,
+    workers: int | None,
+    scheduler: str | None,
+    verbose: bool,
+    quiet: bool,
+    as_json: bool,
+    **settings: Any,
 ) -> None:
     """Compress the transfer tensors of the clusters store STORE into an asset that pictures are made from."""
     from relightcli.stages.factorize import Config, factorize
@@ -51,6 +59,7 @@ def command(
         store=store, output=output, workers=workers or options.available_cores(), quiet=quiet or as_json, **settings
     )
     result = factorize(config)
+    options.note_no_blocks(result, scheduler)
     options.tell(result, _text(result), as_json, quiet)
 
 

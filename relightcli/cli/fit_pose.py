@@ -11,7 +11,7 @@ from relightcli.cli import options
 
 
 @click.command(name="fit-pose")
-@click.argument("store", type=options.PATH)
+@click.argument("store", type=options.store_path)
 @options.output("Pose store to make, e.g. pose.zarr.")
 @click.option(
     "--model",
@@ -56,10 +56,18 @@ from relightcli.cli import options
 )
 @click.option("--dry-run", is_flag=True, help="Say what would be made; do nothing.")
 @options.workers
+@options.scheduler
 @options.overwrite
 @options.report
 def command(
-    store: Path, output: Path, workers: int | None, verbose: bool, quiet: bool, as_json: bool, **settings: Any
+    store: Path,
+    output: Path,
+    workers: int | None,
+    scheduler: str | None,
+    verbose: bool,
+    quiet: bool,
+    as_json: bool,
+    **settings: Any,
 ) -> None:
     """Learn from the transfer store STORE what skinned objects see of the sky in any pose."""
     from relightcli.stages.fit_pose import Config, fit_pose
@@ -68,6 +76,7 @@ def command(
         store=store, output=output, workers=workers or options.available_cores(), quiet=quiet or as_json, **settings
     )
     result = fit_pose(config)
+    options.note_no_blocks(result, scheduler)
     options.tell(result, _text(result), as_json, quiet)
 
 

@@ -12,7 +12,7 @@ from relightcli.cli.exits import BAD_STORE, OK
 
 
 @click.command(name="inspect")
-@click.argument("store", type=options.PATH)
+@click.argument("store", type=options.store_path)
 @click.option("--verify", is_flag=True, help="Read every chunk and check it; exit 3 if anything is wrong.")
 @click.option("--picture", default=None, type=options.PATH, help="Draw the clusters of lights into this picture.")
 @click.option("--env", default=None, type=options.PATH, help="Of --picture: the map under the clusters' borders.")

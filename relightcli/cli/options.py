@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 import click
 
@@ -14,6 +15,31 @@ Command = Callable[..., Any]
 SEED = click.IntRange(0, 2**63 - 1)
 # What may not be read is a system error (5), not bad usage (2); the stages say so.
 PATH = click.Path(path_type=Path, readable=False)
+
+
+class Url(type(Path())):  # type: ignore[misc]
+    """A URL that goes through the stages as a path does: no file of this machine, and spelled as it was given."""
+
+    def __new__(cls, url: str) -> Url:
+        self: Url = super().__new__(cls, url)
+        self._url = url
+        return self
+
+    def __str__(self) -> str:
+        return str(getattr(self, "_url", None) or super().__str__())
+
+    def __fspath__(self) -> str:
+        return str(self)
+
+    def __reduce__(self) -> tuple[type[Url], tuple[str]]:
+        return Url, (str(self),)
+
+
+def store_path(value: str) -> Path:
+    """A store: a path, or a URL."""
+    if value.startswith("file://"):
+        return Path(unquote(urlsplit(value).path))
+    return Url(value) if "://" in value else Path(value)
 
 
 def available_cores() -> int:
@@ -24,13 +50,28 @@ def available_cores() -> int:
 
 
 def output(help: str) -> Callable[[Command], Command]:
-    return click.option("-o", "--output", required=True, type=PATH, help=help)
+    return click.option("-o", "--output", required=True, type=store_path, help=help)
 
 
 def workers(command: Command) -> Command:
     return click.option(
         "--workers", type=click.IntRange(1, 1024), default=None, help="Worker processes. Default: all cores."
     )(command)
+
+
+def scheduler(command: Command) -> Command:
+    return click.option(
+        "--scheduler",
+        default=None,
+        metavar="ADDRESS",
+        help="Dask scheduler, e.g. tcp://host:8786, whose workers run the blocks instead of local processes.",
+    )(command)
+
+
+def note_no_blocks(result: dict[str, Any], scheduler: str | None) -> None:
+    """Tells the user that there was nothing for a scheduler to do."""
+    if scheduler is not None:
+        result["notes"].append("--scheduler: this work is not made of blocks; it is done here, in --workers threads")
 
 
 def overwrite(command: Command) -> Command:

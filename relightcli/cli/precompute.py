@@ -101,6 +101,7 @@ from relightcli.cli import options
 @click.option("--allow-outside", is_flag=True, help="Let the scene file use files outside its folder.")
 @click.option("--dry-run", is_flag=True, help="Print the plan and its predicted cost; do nothing.")
 @options.workers
+@options.scheduler
 @options.overwrite
 @options.report
 def command(

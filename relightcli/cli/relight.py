@@ -11,7 +11,7 @@ from relightcli.cli import options
 
 
 @click.command(name="relight")
-@click.argument("store", type=options.PATH)
+@click.argument("store", type=options.store_path)
 @click.option(
     "-o",
     "--output",
@@ -67,6 +67,7 @@ from relightcli.cli import options
 @click.option("--allow-outside", is_flag=True, help="Let a scene file use files outside its folder.")
 @click.option("--dry-run", is_flag=True, help="Say what would be written; do nothing.")
 @options.workers
+@options.scheduler
 @options.overwrite
 @options.report
 def command(
@@ -91,6 +92,8 @@ def command(
     if as_json and config.output == "-":
         raise click.UsageError("--json and -o - both want stdout")
     result = relight(config)
+    if not config.reference:
+        options.note_no_blocks(result, config.scheduler)
     options.tell(result, _text(result), as_json, quiet)
 
 

@@ -1,4 +1,4 @@
-"""The block scheduler: whole blocks to local worker processes, finished ones into the store's ledger.
+"""The block scheduler: whole blocks to worker processes, local ones or Dask's, finished ones into the store's ledger.
 
 A job knows how to do any one of its blocks and nothing of the others. Blocks are independent, write chunks that no
 other block owns, and count as done when the ledger says so. The result therefore depends neither on the number of
@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Hashable, Iterable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping, Set
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -54,7 +54,7 @@ class Job(Hashable, Protocol):
 
 class Ledger(Protocol):
     @property
-    def done(self) -> frozenset[str]: ...
+    def done(self) -> Set[str]: ...
 
     def record(self, block_id: str, info: dict[str, Any]) -> None: ...
 
@@ -72,8 +72,12 @@ def run_blocks(
     workers: int,
     label: str,
     quiet: bool = False,
+    scheduler: str | None = None,
 ) -> None:
-    """Runs every block that the ledger does not hold yet. Raises what a block raised; what is done stays done."""
+    """Runs every block that the ledger does not hold yet. Raises what a block raised; what is done stays done.
+
+    scheduler: address of a Dask scheduler, whose workers run the blocks instead of local processes.
+    """
     todo = [b for b in blocks if b.id not in ledger.done]
     total = len(todo) + len(ledger.done)
     if not todo:
@@ -84,9 +88,14 @@ def run_blocks(
             ledger.record(block.id, info)
             progress.step(info)
 
+        if scheduler is not None:
+            from relightcli.run.scheduler import run_on_cluster
+
+            run_on_cluster(scheduler, job, todo, finish, label)
+            return
         if workers <= 1 or len(todo) == 1:
             for block in todo:
-                finish(block, _run(job, block))
+                finish(block, run_one(job, block))
             return
         idle_failures = 0
         while todo:
@@ -102,6 +111,15 @@ def run_blocks(
                         f"worker processes of {label} keep dying (killed, or out of memory); "
                         "what is finished is kept: run again with fewer --workers"
                     ) from None
+
+
+def need_scheduler(address: str | None) -> None:
+    """Refuses a Dask scheduler that does not answer, before work goes into anything. Raises InputError, SystemFault."""
+    if address is not None:
+        from relightcli.run.scheduler import connected
+
+        with connected(address):
+            pass
 
 
 def _drain(pool: Executor, job: Job, todo: list[Block], finish: Callable[[Block, Info], None]) -> list[Block]:
@@ -125,7 +143,7 @@ def _hand_in(
     """Submits the blocks. Workers start meanwhile; an interrupt waits until they know that it is not theirs."""
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        futures = {pool.submit(_run, job, block): block for block in todo}
+        futures = {pool.submit(run_one, job, block): block for block in todo}
         for future in futures:
             future.add_done_callback(ended.put)
         return futures
@@ -183,7 +201,8 @@ def _leave_worker(signum: int, frame: FrameType | None) -> None:
 _opened: tuple[Job, Worker] | None = None
 
 
-def _run(job: Job, block: Block) -> Info:
+def run_one(job: Job, block: Block) -> Info:
+    """Does one block in this process, which keeps the job open for the next."""
     global _opened
     if _opened is None or _opened[0] != job:
         _opened = None

@@ -26,7 +26,8 @@ def diff(a: str | Path, b: str | Path, settings: DiffSettings) -> DiffResult:
     Raises InputError for pairs that do not match in kind, names, sizes or channels, and for pictures that cannot be
     read; StoreError for stores that cannot; OSError where the heat map or the report cannot be written.
     """
-    a, b = Path(a), Path(b)
+    # Not `Path(a)` of a path, which spells a URL otherwise.
+    a, b = (path if isinstance(path, Path) else Path(path) for path in (a, b))
     kind = _kind(a)
     if _kind(b) != kind:
         raise InputError(f"{a} is a {kind} and {b} a {_kind(b)}; expected two of a kind.")
@@ -96,6 +97,8 @@ def heatmap_range(error: NDArray[np.float64], metric: str) -> float:
 
 
 def _kind(path: Path) -> str:
+    if "://" in str(path):  # pictures are read from files only
+        return "store"
     if "#" in path.name and not path.exists():
         return "sequence"
     if path.is_dir():

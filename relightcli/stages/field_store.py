@@ -184,12 +184,15 @@ def put_body(
     )
 
 
-def simulate(writer: formats.Writer, specs: list[FieldSpec], workers: int, quiet: bool) -> None:
+def simulate(
+    writer: formats.Writer, specs: list[FieldSpec], workers: int, quiet: bool, scheduler: str | None = None
+) -> None:
     """Every block of the fields that `put_body` has laid down and the ledger does not hold."""
     fields = tuple(specs)
     partial = str(writer.partial_path)
     own = [run.Block(f"{s.prefix or 'field/'}self", k, k + 1) for k, s in enumerate(specs)]
-    run.run_blocks(SelfJob(partial, fields), own, writer, workers=workers, label="self transfer", quiet=quiet)
+    job = SelfJob(partial, fields)
+    run.run_blocks(job, own, writer, workers=workers, label="self transfer", quiet=quiet, scheduler=scheduler)
     blocks, first = [], 0
     for spec in specs:
         for shell in range(spec.shells):
@@ -198,7 +201,8 @@ def simulate(writer: formats.Writer, specs: list[FieldSpec], workers: int, quiet
                 stop = min(start + spec.block, first + (shell + 1) * spec.cells)
                 blocks.append(run.Block(f"{spec.prefix or 'field/'}samples/{shell:03d}/{cell:06d}", start, stop))
         first += spec.shells * spec.cells
-    run.run_blocks(SampleJob(partial, fields), blocks, writer, workers=workers, label="fields", quiet=quiet)
+    samples = SampleJob(partial, fields)
+    run.run_blocks(samples, blocks, writer, workers=workers, label="fields", quiet=quiet, scheduler=scheduler)
     run.close_worker()
 
 

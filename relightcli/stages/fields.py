@@ -238,17 +238,23 @@ def describe(moving: Moving, scene: Scene, starts: tuple[int, ...]) -> dict[str,
 
 
 def put_fields(
-    writer: formats.Writer, moving: Moving, scene: Scene, settings: FieldSettings, workers: int, quiet: bool
+    writer: formats.Writer,
+    moving: Moving,
+    scene: Scene,
+    settings: FieldSettings,
+    workers: int,
+    quiet: bool,
+    scheduler: str | None = None,
 ) -> None:
     """Simulates every field into the store, or takes it from the library, where it is simulated if it is not there."""
     if settings.library is None:
         for field in moving.fields:
             _put_body(writer, field)
-        simulate(writer, [field.spec for field in moving.fields], workers, quiet)
+        simulate(writer, [field.spec for field in moving.fields], workers, quiet, scheduler)
     else:
         settings.library.mkdir(parents=True, exist_ok=True)
         for field in moving.fields:
-            copy_field(_from_library(field, settings, workers, quiet), writer, field.spec.prefix)
+            copy_field(_from_library(field, settings, workers, quiet, scheduler), writer, field.spec.prefix)
     spacing = "geometric" if settings.spacing == "adaptive" else settings.spacing
     for j, light in enumerate(scene.lights.values()):
         source = source_field(light, settings.shells, settings.resolution_of(False), settings.order, spacing)
@@ -284,7 +290,9 @@ def library_store(field: Distinct, library: Path) -> Path:
     return library / f"{key.partition(':')[2][:32]}.zarr"
 
 
-def _from_library(field: Distinct, settings: FieldSettings, workers: int, quiet: bool) -> formats.Store:
+def _from_library(
+    field: Distinct, settings: FieldSettings, workers: int, quiet: bool, scheduler: str | None
+) -> formats.Store:
     assert settings.library is not None
     path = library_store(field, settings.library)
     writer = formats.begin(
@@ -294,7 +302,7 @@ def _from_library(field: Distinct, settings: FieldSettings, workers: int, quiet:
         with writer:
             alone = replace(field, spec=replace(field.spec, prefix=""))
             _put_body(writer, alone)
-            simulate(writer, [alone.spec], workers, quiet)
+            simulate(writer, [alone.spec], workers, quiet, scheduler)
             writer.commit({})
     return formats.open_store(path, KIND)
 

@@ -62,6 +62,7 @@ class Config:
     camera: str | None = None
     seed: int = 0
     workers: int = 1
+    scheduler: str | None = None
     overwrite: bool = False
     dry_run: bool = False
     quiet: bool = False
@@ -72,6 +73,7 @@ def cluster_lights(config: Config) -> dict[str, Any]:
     started = time.perf_counter()
     epsilon = _check(config)
     need_output(config.output)
+    run.need_scheduler(None if config.dry_run else config.scheduler)
     lighting = LightingStore(config.store, config.workers)
     need_still(lighting.store)
     if lighting.store.kind != "transfer":
@@ -144,7 +146,15 @@ def cluster_lights(config: Config) -> dict[str, Any]:
         blocks = []
         for name, tree in zip(("fraction", "lobe"), trees, strict=False):
             blocks += run.split(name, len(tree), CLUSTERS)
-        run.run_blocks(job, blocks, writer, workers=config.workers, label="clusters", quiet=config.quiet)
+        run.run_blocks(
+            job,
+            blocks,
+            writer,
+            workers=config.workers,
+            label="clusters",
+            quiet=config.quiet,
+            scheduler=config.scheduler,
+        )
         if "check" not in writer.done:
             writer.record("check", job.open().check(trees[0], config.seed))
         run.close_worker()
@@ -279,6 +289,7 @@ def _refine(job: ClusterJob, writer: formats.Writer, config: Config, prefix: str
         workers=config.workers,
         label="light",
         quiet=config.quiet,
+        scheduler=config.scheduler,
     )
     for block in writer.blocks:
         if block["id"].startswith(f"{prefix}refine/"):

@@ -79,7 +79,8 @@ class _Coats:
 def read_scene(store: formats.Store) -> tuple[Scene, Geometry]:
     """The scene that a transfer store was made from, as the store keeps it."""
     read: Any = store.read
-    scene = scene_from_json(store.attrs["scene"], folder=store.path.parent)
+    folder = store.path.parent if isinstance(store.path, Path) else None  # maps are read from files only
+    scene = scene_from_json(store.attrs["scene"], folder=folder)
     textures = {int(name.split("/")[1]): read(name) for name in store.names() if name.startswith("textures/")}
     geometry = Geometry(
         tuple(scene.objects),
@@ -107,7 +108,7 @@ def need_still(store: formats.Store) -> None:
 
 
 @contextlib.contextmanager
-def described(path: Path) -> Iterator[None]:
+def described(path: object) -> Iterator[None]:
     """A store whose files are sound, but which does not describe what its kind has to: StoreError."""
     try:
         yield
@@ -220,9 +221,11 @@ class LightingStore:
         buried: NDArray[np.bool_] = found
         return buried
 
-    def blocks(self, first: int = 0, last: int | None = None) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
+    def blocks(
+        self, first: int = 0, last: int | None = None, needed: NDArray[np.bool_] | None = None
+    ) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
         """Visibility bits in ranges of the receivers from `first` to `last`: all at once if they are in memory, else
-        chunk by chunk."""
+        chunk by chunk, of which those without any receiver `needed` (N,) are not read."""
         last = len(self) if last is None else last
         if self._bits is not None:
             yield slice(first, last), self._bits.result()[first:last]
@@ -230,16 +233,23 @@ class LightingStore:
         array: Any = self.store.array("visibility/bits")
         for start in range(first - first % self._chunk, last, self._chunk):
             rows = slice(max(start, first), min(start + self._chunk, last))
-            yield rows, np.asarray(array[rows])
+            if needed is None or needed[rows].any():
+                yield rows, np.asarray(array[rows])
 
     def bits_of(self, receivers: NDArray[np.integer[Any]]) -> NDArray[np.uint8]:
         """Visibility bits of some receivers, rising indices."""
         parts = []
-        for block, bits in self.blocks():
+        for block, bits in self.blocks(needed=self._mask(receivers)):
             own = receivers[(receivers >= block.start) & (receivers < block.stop)]
             if len(own):
                 parts.append(bits[own - block.start])
         return np.concatenate(parts)
+
+    def _mask(self, receivers: NDArray[np.integer[Any]]) -> NDArray[np.bool_]:
+        """Which receivers are among those, (N,)."""
+        mask = np.zeros(len(self), bool)
+        mask[receivers] = True
+        return mask
 
     def exit_radiance(
         self,
@@ -327,7 +337,7 @@ class LightingStore:
         """Specular light of the sky at `rows`, integrated from the bits, (N, 3); 0 elsewhere."""
         specular = np.zeros((len(self), 3), np.float32)
         tree = sky_tree(splat(sky), environment, rotate)
-        for block, bits in self.blocks():
+        for block, bits in self.blocks(needed=self._mask(rows)):
             pick = rows[(rows >= block.start) & (rows < block.stop)]
             if len(pick):
                 specular[pick] = specular_radiance(
@@ -508,8 +518,8 @@ class LightingStore:
     def _irradiance(self, sky: SkyCube, active: NDArray[np.bool_] | None, basis: str) -> NDArray[np.float32]:
         if basis == "visibility":
             prefix = moment_prefix(splat(sky))
-            out = np.empty((len(self), 3), np.float32)
-            for rows, bits in self.blocks():
+            out = np.zeros((len(self), 3), np.float32)
+            for rows, bits in self.blocks(needed=active):
                 mask = None if active is None else active[rows]
                 out[rows] = irradiance(bits, self.normal[rows], prefix, self.threads, mask)
             return out

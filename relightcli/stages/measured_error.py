@@ -202,7 +202,9 @@ class Trial(LightingStore):
     def buried(self) -> NDArray[np.bool_]:
         return self._buried
 
-    def blocks(self, first: int = 0, last: int | None = None) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
+    def blocks(
+        self, first: int = 0, last: int | None = None, needed: NDArray[np.bool_] | None = None
+    ) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
         last = len(self) if last is None else last
         yield slice(first, last), self._seen_bits[first:last]
 

@@ -48,6 +48,7 @@ class Config:
     bounces: int | None = None
     seed: int = 0
     workers: int = 1
+    scheduler: str | None = None
     overwrite: bool = False
     allow_outside: bool = False
     dry_run: bool = False

@@ -125,6 +125,7 @@ def simulate_poses(
     surroundings: bool,
     workers: int,
     quiet: bool,
+    scheduler: str | None = None,
 ) -> None:
     """Lays down and traces the frames of every skinned object that has clips."""
     about = {}
@@ -150,7 +151,8 @@ def simulate_poses(
         others = tuple(geometry.object_names.index(other) for other in geometry.rigs if other != name)
         job = PoseJob(str(writer.partial_path), group, own, order, directions, others, surroundings)
         blocks = run.split(group, len(frames), size)
-        run.run_blocks(job, blocks, writer, workers=workers, label=f"poses of {name}", quiet=quiet)
+        label = f"poses of {name}"
+        run.run_blocks(job, blocks, writer, workers=workers, label=label, quiet=quiet, scheduler=scheduler)
         run.close_worker()
     writer.set_attrs({"poses": about})
 

@@ -136,9 +136,11 @@ class PoseStore(LightingStore):
         """The bits of all receivers as the store has them."""
         return super().blocks()
 
-    def blocks(self, first: int = 0, last: int | None = None) -> Iterator[tuple[slice, U8]]:
+    def blocks(
+        self, first: int = 0, last: int | None = None, needed: NDArray[np.bool_] | None = None
+    ) -> Iterator[tuple[slice, U8]]:
         """See `LightingStore.blocks`; past characters where they are posed."""
-        for part, bits in super().blocks(first, last):
+        for part, bits in super().blocks(first, last, needed):
             yield part, bits if self._scene is None else self._scene.past(part, bits)
 
     def gather(self, first: int = 0) -> Gather | None:

@@ -32,6 +32,7 @@ def precompute(config: Config) -> dict[str, Any]:
     """Runs the stage; returns a summary for the user. Raises the errors of `relightcli.errors` and OSError."""
     started = time.perf_counter()
     need_output(config.output)
+    run.need_scheduler(None if config.dry_run else config.scheduler)
     prepared = prepare(config)
     if config.dry_run:
         return dry_run(prepared)
@@ -94,10 +95,11 @@ def precompute(config: Config) -> dict[str, Any]:
             workers=config.workers,
             label="visibility",
             quiet=config.quiet,
+            scheduler=config.scheduler,
         )
         run.close_worker()
         if moving is not None:
-            put_fields(writer, moving, scene, config.fields, config.workers, config.quiet)
+            put_fields(writer, moving, scene, config.fields, config.workers, config.quiet, config.scheduler)
         if "pose" in prepared.simulated:
             simulate_poses(
                 writer,
@@ -109,6 +111,7 @@ def precompute(config: Config) -> dict[str, Any]:
                 config.pose_surroundings,
                 config.workers,
                 config.quiet,
+                config.scheduler,
             )
         if prepared.promise is not None:
             keep_promise(

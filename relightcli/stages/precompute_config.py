@@ -47,6 +47,7 @@ class Config:
     field_library: Path | None = None
     seed: int = 0
     workers: int = 1
+    scheduler: str | None = None
     overwrite: bool = False
     allow_outside: bool = False
     dry_run: bool = False

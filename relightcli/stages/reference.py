@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -110,6 +111,7 @@ def open_source(path: Path, allow_outside: bool = False) -> tuple[Scene, Geometr
 
 def render_reference(config: Config, shots: list[Shot], suffix: str, started: float) -> dict[str, Any]:
     """Path-traces every shot. Samples accumulate in `OUTPUT.samples.partial` until the picture is written."""
+    run.need_scheduler(config.scheduler)
     scene, geometry, fingerprint, own_bounces = open_source(config.store, config.allow_outside)
     check_shots(config, shots, scene)
     for shot in shots:
@@ -155,8 +157,8 @@ def render_reference(config: Config, shots: list[Shot], suffix: str, started: fl
                 _create(writer, layers, height, width, rows)
                 job = ReferenceJob(
                     str(writer.partial_path),
-                    str(config.store),
-                    str(environment),
+                    os.path.abspath(config.store),  # a worker may run in another folder
+                    os.path.abspath(environment),
                     shot.env_rotate,
                     camera.name,
                     shot.settings,
@@ -175,6 +177,7 @@ def render_reference(config: Config, shots: list[Shot], suffix: str, started: fl
                     workers=config.workers,
                     label="reference",
                     quiet=config.quiet,
+                    scheduler=config.scheduler,
                 )
                 run.close_worker()
                 writer.commit({})

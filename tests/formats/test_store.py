@@ -75,8 +75,8 @@ def test_nothing_there(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     with pytest.raises(StoreError, match="expected a relight store, found a file"):
         open_store(tmp_path / "file")
-    with pytest.raises(StoreError, match="found a URL"):
-        open_store("https://example.org/store.zarr")
+    with pytest.raises(StoreError, match="a URL that fsspec can open"):
+        open_store("nothing://example.org/store.zarr")
 
 
 def test_unfinished_work_does_not_open_and_shows_its_progress(tmp_path: Path) -> None:

@@ -108,3 +108,19 @@ class FailingBesideASleeper:
         while not list(Path(self.folder).glob("pid.*")):
             time.sleep(0.01)
         raise ValueError("bug")
+
+
+@dataclass(frozen=True)
+class Slow:
+    """Notes when a block begins and when it ends, a second later."""
+
+    folder: str
+
+    def open(self):
+        return self
+
+    def run(self, block):
+        (Path(self.folder) / f"{block.start}.begun").touch()
+        time.sleep(1)
+        (Path(self.folder) / f"{block.start}.ended").touch()
+        return {}
