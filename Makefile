@@ -1,9 +1,9 @@
-# make demo | tradeoff | test | lint | bench | recipes | clean. Each sets up what it needs in .venv.
+# make demo | tradeoff | test | lint | bench | numerics | recipes | clean. Each sets up what it needs in .venv.
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: demo tradeoff test lint bench recipes clean
+.PHONY: demo tradeoff test lint bench numerics recipes clean
 
 $(VENV)/.base: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -39,6 +39,9 @@ lint: $(VENV)/.lint
 
 bench: $(VENV)/.bench
 	$(BIN)/python -m benchmarks
+
+numerics: $(VENV)/.test  ## the digits that every numerical kernel loses, as a table; leaves build/numerics.json
+	$(BIN)/python -m benchmarks.numerics
 
 recipes: $(VENV)/.base  ## every recipe end to end; each ends in a check
 	for r in recipes/*/Makefile; do \
