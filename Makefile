@@ -1,9 +1,9 @@
-# make demo | tradeoff | test | lint | bench | numerics | recipes | clean. Each sets up what it needs in .venv.
+# make demo | tradeoff | test | lint | bench | numerics | hard-cases | recipes | clean. Each sets up what it needs in .venv.
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: demo tradeoff test lint bench numerics recipes clean
+.PHONY: demo tradeoff test lint bench numerics hard-cases recipes clean
 
 $(VENV)/.base: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -42,6 +42,9 @@ bench: $(VENV)/.bench
 
 numerics: $(VENV)/.test  ## the digits that every numerical kernel loses, as a table; leaves build/numerics.json
 	$(BIN)/python -m benchmarks.numerics
+
+hard-cases: $(VENV)/.test  ## the hard cases with their figures, into docs/hard-cases.md
+	$(BIN)/python -m tests.hard.document
 
 recipes: $(VENV)/.base  ## every recipe end to end; each ends in a check
 	for r in recipes/*/Makefile; do \
