@@ -31,10 +31,9 @@ class Figures:
         if report.when == "call" or report.outcome != "passed":
             figures = [value for key, value in report.user_properties if key == "figure"]
             self.rows.append({"node": report.nodeid, "outcome": report.outcome, "figures": figures})
-
-    def pytest_sessionfinish(self) -> None:
-        self.target.parent.mkdir(parents=True, exist_ok=True)
-        self.target.write_text(json.dumps(self.rows, indent=1) + "\n")
+            # Each time anew: what a run that is killed has measured is not lost.
+            self.target.parent.mkdir(parents=True, exist_ok=True)
+            self.target.write_text(json.dumps(self.rows, indent=1) + "\n")
 
 
 @pytest.fixture
