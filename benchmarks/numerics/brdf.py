@@ -236,8 +236,8 @@ def gaussians():
     "brdf/disc.py",
     "2 to 64 cells across, to the rim",
     "float64",
-    2.0,
-    "1 - |p|^2 of cells that touch the rim is as small as 2/N: its rounding over it",
+    1.5,
+    "1 - |p|^2 of cells that touch the rim is as small as 2/N = 1/32: its rounding over it",
 )
 def disc():
     from relightcli.core.brdf.disc import disc_grid
@@ -299,8 +299,8 @@ def tucker():
     "compress/cpca.py",
     "rows that differ by 1e-6 of what they have in common",
     "float64",
-    6.0,
-    "rows are float64 with 10 digits left where they differ: squares of differences have 10",
+    2.0,
+    "what all rows have in common is taken off before squares are; sums of 720 of them",
 )
 def clusters():
     from relightcli.core.compress.cpca import cpca

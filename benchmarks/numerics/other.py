@@ -75,8 +75,8 @@ def hemisphere():
     "brdf/navigation.py",
     "roughness 1e-4 to 10, points 1e-7 beside an entry",
     "float64",
-    9.0,
-    "barycentric weights of a point 1e-7 beside a corner have its distance's digits; relative to 1 of every parameter",
+    1.5,
+    "a system of two rows in a plane scaled to 1; what the weights give back, relative to the range of a parameter",
 )
 def mixes():
     from relightcli.core.brdf.navigation import exponent_mix, fresnel_roughness_mix

@@ -83,4 +83,4 @@ def markdown(rows: Sequence[Loss]) -> str:
     for r in rows:
         numbers = (f"{r.largest:.1e}", f"{r.median:.1e}", f"{r.lost:.1f}", f"{r.bound:.1f}")
         lines.append((r.kernel, r.stress, r.storage, *numbers, r.why))
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
