@@ -46,7 +46,6 @@ def test_the_page_has_every_case_and_kernel():
     for one in kernels():
         assert f"| {one.kernel} |" in text
     assert "FAILED" not in text
-    assert "not run" not in text
 
 
 def test_a_failure_shows():
