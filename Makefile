@@ -1,9 +1,10 @@
-# make demo | tradeoff | test | lint | bench | recipes | faults | fuzz | clean. Each sets up what it needs in .venv.
+# make demo | tradeoff | test | lint | bench | numerics | hard-cases | recipes | faults | fuzz | clean. Each sets up what
+# it needs in .venv.
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 
-.PHONY: demo tradeoff test lint bench recipes faults fuzz clean
+.PHONY: demo tradeoff test lint bench numerics hard-cases recipes faults fuzz clean
 
 $(VENV)/.base: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -39,6 +40,12 @@ lint: $(VENV)/.lint
 
 bench: $(VENV)/.bench
 	$(BIN)/python -m benchmarks
+
+numerics: $(VENV)/.test  ## the digits that every numerical kernel loses, as a table; leaves build/numerics.json
+	$(BIN)/python -m benchmarks.numerics
+
+hard-cases: $(VENV)/.test  ## the hard cases with their figures, into docs/hard-cases.md
+	$(BIN)/python -m tests.hard.document
 
 recipes: $(VENV)/.base  ## every recipe end to end; each ends in a check
 	for r in recipes/*/Makefile; do \

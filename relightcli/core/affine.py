@@ -22,10 +22,12 @@ def compose(translate: F64, axis: F64, degrees: float, scale: F64) -> F64:
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     # Quarter turns come out exact, so that an axis-aligned box stays axis-aligned.
     turn = math.remainder(degrees, 360.0)
-    quarter = {0.0: (0.0, 1.0), 90.0: (1.0, 0.0), -90.0: (-1.0, 0.0), 180.0: (0.0, -1.0), -180.0: (0.0, -1.0)}
-    sin, cos = quarter.get(turn, (math.sin(math.radians(turn)), math.cos(math.radians(turn))))
+    quarter = {0.0: (0.0, 0.0), 90.0: (1.0, 1.0), -90.0: (-1.0, 1.0), 180.0: (0.0, 2.0), -180.0: (0.0, 2.0)}
+    angle = math.radians(turn)
+    # 1 - cos(a) as 2 sin(a/2)^2, which keeps its digits where a is small.
+    sin, height = quarter.get(turn, (math.sin(angle), 2.0 * math.sin(0.5 * angle) ** 2))
     matrix = np.eye(4)
-    matrix[:3, :3] = (np.eye(3) + sin * cross + (1.0 - cos) * (cross @ cross)) * scale
+    matrix[:3, :3] = (np.eye(3) + sin * cross + height * (cross @ cross)) * scale
     matrix[:3, 3] = translate
     return matrix
 

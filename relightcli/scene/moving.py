@@ -10,6 +10,7 @@ decomposition); P stays. A rectangle's edges are turned from where the scene fil
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -157,12 +158,13 @@ def rotation(degrees: Iterable[float]) -> F64:
 
 def angles(turn: F64) -> tuple[float, float, float]:
     """Degrees of `rotation` that give the rotation (3, 3). Where x and z turn about one axis, x is 0."""
-    sine = float(np.clip(-turn[2, 0], -1.0, 1.0))
-    y = np.arcsin(sine)
-    if abs(sine) > 1.0 - 1e-12:
-        return 0.0, float(np.degrees(y)), float(np.degrees(np.arctan2(-turn[0, 1], turn[1, 1])))
-    x, z = np.arctan2(turn[2, 1], turn[2, 2]), np.arctan2(turn[1, 0], turn[0, 0])
-    return float(np.degrees(x)), float(np.degrees(y)), float(np.degrees(z))
+    cosine = math.hypot(turn[0, 0], turn[1, 0])
+    y = math.atan2(-turn[2, 0], cosine)  # the arcus sine knows half the digits of a turn by nearly 90 degrees
+    x = math.atan2(turn[2, 1], turn[2, 2]) if cosine > 1e-14 else 0.0
+    # What is left when x is turned back: near 90 degrees x and z apart are noise, but together they are not.
+    s, c = math.sin(x), math.cos(x)
+    z = math.atan2(s * turn[0, 2] - c * turn[0, 1], c * turn[1, 1] - s * turn[1, 2])
+    return math.degrees(x), math.degrees(y), math.degrees(z)
 
 
 def between(a: tuple[float, ...], b: tuple[float, ...], t: float) -> tuple[float, ...]:

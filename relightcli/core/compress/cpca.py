@@ -44,6 +44,8 @@ def cpca(rows: NDArray[np.floating], clusters: int, terms: int, seed: int = 0) -
         raise NumericalError("clustering: rows that are not finite")
     n = len(x)
     norm2 = float((x**2).sum())
+    # Distances are differences of squares below: what all rows have in common would take their digits.
+    x = x - x.mean(0) if n else x
     clusters = max(1, min(clusters, n))
     square = (x**2).sum(1)
     label = _nearest(x, square, _plus_plus(x, square, clusters, np.random.default_rng(seed)))

@@ -2,7 +2,10 @@
 
 A sphere of radius r and even radiance L is a disc of sine r / distance about the direction d to its centre:
 
-    L_lm = L 2 pi (P_(l-1)(c) - P_(l+1)(c)) / (2 l + 1) y_lm(d),   L_00 = L 2 pi (1 - c) y_00,   c = cos(half-angle)
+    L_lm = L 2 pi (1 - c^2) P_l'(c) / (l (l + 1)) y_lm(d),   L_00 = L 2 pi (1 - c) y_00,   c = cos(half-angle)
+
+the integral of P_l from c to 1, usually written (P_(l-1)(c) - P_(l+1)(c)) / (2 l + 1), a difference that has no digit
+left for a small disc, where both are nearly 1.
 
 A rectangle's is the integral over its area of y(direction) cos / distance^2 where it faces the sample, by
 Gauss-Legendre points: NEAR_NODES along an edge within two of its radii, FAR_NODES beyond.
@@ -51,13 +54,15 @@ def disc_light(to_center: NDArray[np.float64], radius: float, order: int) -> NDA
     """Coefficients (n, N) of unit radiance from spheres at to_center (n, 3); 0 from inside, where nothing arrives."""
     distance = np.linalg.norm(to_center, axis=1)
     outside = distance > radius
-    sine2 = (radius / np.where(outside, distance, radius)) ** 2
-    c = np.sqrt(1.0 - sine2)
-    legendre = [np.ones(len(c)), c]
-    for band in range(1, order):
+    far = np.where(outside, distance, radius)
+    sine2 = (radius / far) ** 2
+    c = np.sqrt((far - radius) * (far + radius)) / far
+    legendre, slope = [np.ones(len(c)), c], [np.zeros(len(c)), np.ones(len(c))]
+    for band in range(1, order - 1):
         legendre.append(((2 * band + 1) * c * legendre[band] - band * legendre[band - 1]) / (band + 1))
+        slope.append(slope[band - 1] + (2 * band + 1) * legendre[band])
     factors = [2.0 * math.pi * sine2 / (1.0 + c)]
-    factors += [2.0 * math.pi * (legendre[b - 1] - legendre[b + 1]) / (2 * b + 1) for b in range(1, order)]
+    factors += [2.0 * math.pi * sine2 * slope[b] / (b * (b + 1)) for b in range(1, order)]
     per_term = np.stack(factors, axis=1)[:, np.repeat(np.arange(order), 2 * np.arange(order) + 1)]
     direction = to_center / np.where(outside, distance, 1.0)[:, None]
     out = np.zeros((len(c), order * order))

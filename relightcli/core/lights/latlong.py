@@ -55,10 +55,12 @@ class LatLong(NamedTuple):
 def texel_solid_angles(height: int, width: int) -> NDArray[np.float64]:
     """Exact solid angle of one texel of each row, (H,) float64, sr: (2 pi / W)(sin lat_top - sin lat_bottom).
 
-    Written as 2 cos(lat_centre) sin(pi / 2H), which loses no digits at the poles. W times their sum is 4 pi.
+    Written as 2 sin(theta_centre) sin(pi / 2H), theta from the nearer pole, which loses no digits there. W times their
+    sum is 4 pi.
     """
-    centre = math.pi * (0.5 - (np.arange(height) + 0.5) / height)
-    return (4.0 * math.pi / width) * math.sin(0.5 * math.pi / height) * np.cos(centre)
+    centre = np.arange(height) + 0.5
+    theta = math.pi * np.minimum(centre, height - centre) / height
+    return (4.0 * math.pi / width) * math.sin(0.5 * math.pi / height) * np.sin(theta)
 
 
 def make_latlong(radiance: NDArray[np.floating[Any]], rotate_degrees: float = 0.0, compensated: bool = True) -> LatLong:

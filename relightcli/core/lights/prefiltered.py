@@ -206,7 +206,9 @@ def _weigh(node, start, tiles, center, near, end, exponent, scale, tile, weight)
                 continue
             tile[p] = c
             for t in range(center.shape[2]):
-                q = max(2.0 - 2.0 * (x * center[c, 0, t] + y * center[c, 1, t] + z * center[c, 2, t]), 0.0)
+                # Not 2 - 2 cos, of which single precision keeps three digits within a degree.
+                dx, dy, dz = x - center[c, 0, t], y - center[c, 1, t], z - center[c, 2, t]
+                q = dx * dx + dy * dy + dz * dz
                 # t^2 = q + q^2 / 12 + q^3 / 90 + ... of the chord's square q
                 square = q * (1.0 + q * (1.0 / 12.0 + q * (1.0 / 90.0)))
                 weight[p, t] = scale * math.exp(exponent * square) if q < end else 0.0

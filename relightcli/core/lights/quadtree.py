@@ -91,13 +91,10 @@ def samples(cell: Cell, resolution: int) -> tuple[NDArray[np.int64], NDArray[np.
 def solid_angles(cells: NDArray[np.integer], resolution: int) -> NDArray[np.float64]:
     """Exact solid angles (C,) of cells (C, 5), sr."""
 
-    def corner(x: NDArray[np.integer], y: NDArray[np.integer]) -> NDArray[np.float64]:
-        a, b = 2.0 * x / resolution - 1.0, 2.0 * y / resolution - 1.0
-        area: NDArray[np.float64] = np.arctan2(a * b, np.sqrt(a * a + b * b + 1.0))
-        return area
-
     _, r0, r1, c0, c1 = np.asarray(cells, np.int64).T
-    return corner(r1, c1) - corner(r0, c1) - corner(r1, c0) + corner(r0, c0)
+    s0, s1, t0, t1 = ((2.0 * x - resolution) / resolution for x in (c0, c1, r0, r1))
+    area = 4.0 * (r1 - r0) * (c1 - c0) / (float(resolution) * resolution)
+    return cube.rectangle_solid_angles(s0, s1, t0, t1, area)
 
 
 def build_tree(leaves: Iterable[Cell], resolution: int) -> Tree:

@@ -16,6 +16,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from relightcli.core.lights.latlong import texel_solid_angles
 from relightcli.core.lights.sun import ANGULAR_RADIUS, SOLID_ANGLE, XYZ_TO_RGB, sun_radiance
 from relightcli.errors import InputError
 
@@ -64,7 +65,7 @@ def sky_latlong(
     edges = math.pi * (0.5 - np.arange(height + 1) / height)  # latitudes of the rows' upper and lower borders
     latitude = 0.5 * (edges[:-1] + edges[1:])
     longitude = math.pi * (1 - 2 * (np.arange(width) + 0.5) / width)
-    texel = (2 * math.pi / width) * (np.sin(edges[:-1]) - np.sin(edges[1:]))  # (H,) exact solid angle
+    texel = texel_solid_angles(height, width)
     # The share of each row above the horizon: with an odd height the middle row has both.
     above = np.clip(edges[:-1], 0, None) - np.clip(edges[1:], 0, None)
     above /= edges[:-1] - edges[1:]
@@ -75,10 +76,12 @@ def sky_latlong(
         zenith = (0.3 + 21 * math.sin(elevation)) * 9 / (7 * math.pi)
         radiance = np.broadcast_to(overcast_luminance(sine, zenith)[..., None], (height, width, 3)).copy()
     else:
-        cos_gamma = sine * math.sin(elevation) + np.cos(latitude)[:, None] * math.cos(elevation) * np.cos(
-            longitude - azimuth
-        )
-        gamma = np.arccos(np.clip(cos_gamma, -1, 1))
+        # Half angles, from which small ones come out as exact as large ones.
+        apart = np.sin(0.5 * (latitude - elevation))[:, None] ** 2
+        around = (np.maximum(np.cos(latitude), 0) * math.cos(elevation))[:, None] * np.sin(
+            0.5 * (longitude - azimuth)
+        ) ** 2
+        gamma = 2 * np.arcsin(np.sqrt(np.minimum(apart + around, 1)))
         radiance = clear_sky(np.broadcast_to(sine, gamma.shape), gamma, elevation, turbidity)
     radiance *= above[:, None, None]
     if not overcast:
@@ -87,8 +90,9 @@ def sky_latlong(
         radiance += (share / texel[:, None])[..., None] * sun
 
     # Integral of sin(latitude) over each texel's part above the horizon.
-    top, bottom = np.sin(np.clip(edges[:-1], 0, None)), np.sin(np.clip(edges[1:], 0, None))
-    cosine_weight = (2 * math.pi / width) * 0.5 * (top**2 - bottom**2)
+    top, bottom = np.clip(edges[:-1], 0, None), np.clip(edges[1:], 0, None)
+    # (sin^2 top - sin^2 bottom) / 2 as a product, which loses nothing next to the zenith.
+    cosine_weight = (math.pi / width) * np.sin(top + bottom) * np.sin(top - bottom)
     upper = np.divide(cosine_weight, above, out=np.zeros(height), where=above > 0)
     irradiance = np.einsum("h,hwc->c", upper, radiance)
     radiance += (1 - above)[:, None, None] * (np.asarray(ground) * irradiance / math.pi)

@@ -44,8 +44,10 @@ def parameters_of(lobes: Lobes, axes: str) -> Parameters:
     value[..., 1 : 1 + count * bands] = lobes.zonal.reshape(frames, vertices, -1)
     place = value[..., 1 + count * bands :].reshape(frames, vertices, count, 2)
     if axes == ANGLES:
-        place[..., 0] = np.arccos(np.clip(lobes.axis[..., 2], -1.0, 1.0))
-        place[..., 1] = np.arctan2(lobes.axis[..., 1], lobes.axis[..., 0])
+        x, y, z = (lobes.axis[..., k].astype(np.float64) for k in range(3))
+        # Not the arcus cosine: of a single precision z near 1 it tells 2e-4 radians and no less.
+        place[..., 0] = np.arctan2(np.hypot(x, y), z)
+        place[..., 1] = np.arctan2(y, x)
     else:
         across = tangents_of(centre)
         cosine = np.einsum("fvxn,vxn->fvx", lobes.axis, centre)

@@ -17,7 +17,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from relightcli.core.pose.clip import Channel, Clip, conjugate, multiply, quaternion_of, rotation_matrix
+from relightcli.core.affine import unit
+from relightcli.core.pose.clip import (
+    Channel,
+    Clip,
+    conjugate,
+    multiply,
+    quaternion_of,
+    rotation_matrix,
+    unit_quaternion,
+)
 from relightcli.core.pose.rig import Rig, node_matrices
 
 F64 = NDArray[np.float64]
@@ -130,14 +139,13 @@ def _nearest_rotation(a: F64, b: F64) -> F64:
     if s[1] > 0.1 * s[0]:
         u[:, 2] *= np.sign(np.linalg.det(u @ v))
         return quaternion_of(u @ v)
-    one, other = a.mean(axis=0), b.mean(axis=0)
-    # Half way between the identity and a half turn lies the turn from one to the other.
-    size = float(np.sqrt((one @ one) * (other @ other)))
-    axis, cosine = np.cross(one, other), float(one @ other)
-    if cosine < -0.999999 * size:  # opposite: half a turn about any axis across
-        axis, cosine = np.cross(one, np.eye(3)[np.argmin(np.abs(one))]), -size
-    q = np.append(axis, size + cosine)
-    return np.asarray(q / np.sqrt(q @ q))
+    one, other = unit(np.stack([a.mean(axis=0), b.mean(axis=0)]))
+    # Half way between the identity and a half turn lies the turn from one to the other; 1 + cos without cancellation.
+    between = one + other
+    axis, height = np.cross(one, other), 0.5 * float(between @ between)
+    if height < 1e-24:  # opposite: half a turn about any axis across
+        axis, height = np.cross(one, np.eye(3)[np.argmin(np.abs(one))]), 0.0
+    return unit_quaternion(np.append(axis, height))
 
 
 def _scale(place: F64, still: F64, target: dict[int, int], above: dict[int, int]) -> float:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from relightcli.core.brdf.models import SPECULAR, dot, lobes_and_density
 from relightcli.core.brdf.sampling import sample_direction
-from relightcli.core.lights.latlong import LUMINANCE, texel_of
+from relightcli.core.lights.latlong import LUMINANCE, texel_of, texel_solid_angles
 from relightcli.core.sphere.lattice import r2_point
 
 SAMPLES = 256  # directions
@@ -47,7 +47,7 @@ def suns(
     s, longitude = np.broadcast_arrays(s[:, :, None], longitude[:, None, :])
     c = np.sqrt(np.maximum(0.0, 1.0 - s * s))
     direction = np.stack([np.sin(longitude) * c, s, np.cos(longitude) * c], axis=-1).reshape(-1, 3)
-    solid_angle = (top - bottom) * (2.0 * math.pi / width) / SUN_POINTS**2
+    solid_angle = texel_solid_angles(height, width)[row] / SUN_POINTS**2
     flux = np.repeat(excess * solid_angle[:, None], SUN_POINTS**2, axis=0)
     return clamped.reshape(radiance.shape), np.ascontiguousarray(direction), flux
 

@@ -40,14 +40,36 @@ def texel_directions(resolution: int) -> NDArray[np.float64]:
 
 
 def solid_angles(resolution: int) -> NDArray[np.float64]:
-    """Exact solid angle of the texels of one face, (R, R) float64, sr; the same for every face, 6 faces sum to 4 pi.
+    """Exact solid angle of the texels of one face, (R, R) float64, sr; the same for every face, 6 faces sum to 4 pi."""
+    # Odd and even numerators over R: edges, and their distances, free of rounding where R is a power of two.
+    edge = (2.0 * np.arange(resolution + 1) - resolution) / resolution
+    low, high, width = edge[:-1], edge[1:], 2.0 / resolution
+    return rectangle_solid_angles(low[None, :], high[None, :], low[:, None], high[:, None], width * width)
 
-    dOmega = A(u1,v1) - A(u0,v1) - A(u1,v0) + A(u0,v0) with A(x,y) = atan2(x y, sqrt(x^2 + y^2 + 1)).
+
+def rectangle_solid_angles(
+    s0: NDArray[np.float64],
+    s1: NDArray[np.float64],
+    t0: NDArray[np.float64],
+    t1: NDArray[np.float64],
+    area: NDArray[np.float64] | float,
+) -> NDArray[np.float64]:
+    """Solid angles (...) of rectangles s0..s1, t0..t1 of a face, of `area` (s1 - s0)(t1 - t0), sr; all broadcast.
+
+    Two triangles, tan(Omega/2) = |a . (b x c)| / (|a||b||c| + (a.b)|c| + (b.c)|a| + (c.a)|b|) [Van Oosterom 1983]: the
+    triple product of corners (s, t, 1) is the rectangle's area, so that nothing cancels, however small it is. The
+    difference of four arcus tangents at the corners loses six digits at 4096 texels a side.
     """
-    edge = 2.0 * np.arange(resolution + 1) / resolution - 1.0
-    x, y = edge[None, :], edge[:, None]
-    area = np.arctan2(x * y, np.sqrt(x * x + y * y + 1.0))
-    return area[1:, 1:] - area[1:, :-1] - area[:-1, 1:] + area[:-1, :-1]
+    a, b, c, d = (1.0 + s * s + t * t for s, t in ((s0, t0), (s1, t0), (s1, t1), (s0, t1)))
+    la, lb, lc, ld = np.sqrt(a), np.sqrt(b), np.sqrt(c), np.sqrt(d)
+    ss, tt = 1.0 + s0 * s1, 1.0 + t0 * t1
+    ab, bc = ss + t0 * t0, tt + s1 * s1
+    cd, da = ss + t1 * t1, tt + s0 * s0
+    ac = ss + t0 * t1
+    one = la * lb * lc + ab * lc + bc * la + ac * lb
+    two = la * lc * ld + ac * ld + cd * la + da * lc
+    found: NDArray[np.float64] = 2.0 * (np.arctan2(area, one) + np.arctan2(area, two))
+    return found
 
 
 def texel_index(directions: NDArray[np.floating], resolution: int) -> NDArray[np.int64]:

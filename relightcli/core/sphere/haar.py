@@ -153,7 +153,7 @@ def _truncate(words, normals, directions, solid_angle, weight, resolution, index
                 chosen[k] = t
                 k += 1
         order = np.argsort(-rank[chosen], kind="mergesort")
-        kept = 0.0
+        kept, left = 0.0, 0.0
         for k in range(count):
             t = chosen[order[k]]
             if kept >= (1.0 - share) * total and share > 0.0:
@@ -161,7 +161,11 @@ def _truncate(words, normals, directions, solid_angle, weight, resolution, index
                 continue
             index[i, k], value[i, k] = t, flat[t]
             kept += np.float64(flat[t]) * np.float64(flat[t])
-        dropped[i] = max(0.0, 1.0 - kept / total) if total > 0.0 else 0.0
+            flat[t] = np.float32(0.0)
+        # Summed by itself: as 1 - kept / total a share below 1e-16 would come out as nothing.
+        for t in range(6 * area):
+            left += np.float64(flat[t]) * np.float64(flat[t])
+        dropped[i] = left / total if total > 0.0 else 0.0
 
 
 @njit(cache=True, nogil=True)
