@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -216,11 +216,12 @@ class _Memory(dict[str, Any]):
 
 @dataclass(frozen=True)
 class Judge:
-    """The path tracer on the scene as it is, before faces were cut."""
+    """The path tracer on the scene as it is, before faces were cut. traced: what it has found, to be asked again."""
 
     scene: Scene
     geometry: Geometry
     tracer: Tracer
+    traced: dict[tuple[Camera, str, int, int, int], NDArray[np.float64]] = field(default_factory=dict)
 
     def error(
         self,
@@ -246,7 +247,12 @@ class Judge:
                 materials = changes[number % len(changes)]
                 light = together(lighting.exit_radiance(sky, 0.0, materials, towards, active, None, bounces))
                 ours = view.pixels(light.diffuse, light.specular)
-                runs = [self.trace(view, sky, materials, truth, seed + run) for run in (0, 1)]
+                runs = []
+                for run in (seed, seed + 1):
+                    key = (view.camera, name, number % len(changes), truth, run)
+                    if key not in self.traced:
+                        self.traced[key] = self.trace(view, sky, materials, truth, run)
+                    runs.append(self.traced[key])
                 where = f"camera {view.camera.name}, {name}{', edited' if number % len(changes) else ''}"
                 worst = larger(worst, share_of(ours - runs[0], ours - runs[1], runs[0], runs[1], where))
         return worst
