@@ -31,7 +31,7 @@ from benchmarks.scenes import Setting
 TOLERANCES = (0.1, 0.05, 0.02, 0.01)
 KEPT = Path("build/promise")
 BOUNCES = 8  # of the references
-CELLS, SIZE, SAMPLES = 24, (64, 48), 128  # along a wall; of a picture; a pixel of each of two references
+CELLS, SIZE, SAMPLES = 20, (64, 48), 128  # along a wall; of a picture; a pixel of each of two references
 KEEPS, LEAST_MEDIAN = 0.95, 0.25
 SECONDS, BYTES = 1.5, 1.2  # factors of what was predicted
 Picture = NDArray[np.float32]

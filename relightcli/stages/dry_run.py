@@ -13,6 +13,7 @@ from relightcli.adapters.rays import Tracer
 from relightcli.core.transport import visibility
 from relightcli.core.transport.hits import trace_hits
 from relightcli.core.transport.receivers import Receivers
+from relightcli.run.accounting import Account
 from relightcli.scene.model import Geometry
 from relightcli.stages.fields import predict
 from relightcli.stages.pose_job import choose_frames
@@ -23,7 +24,7 @@ from relightcli.stages.receiver_setup import PixelReceivers, surfaces_of
 PILOT_GROUPS = 24  # groups of receivers that are traced
 
 
-def dry_run(prepared: Prepared) -> dict[str, Any]:
+def dry_run(prepared: Prepared, account: Account) -> dict[str, Any]:
     """The plan with its cost, predicted from a pilot of a few hundred receivers, and of samples of fields.
 
     The bytes are an upper bound: the mesh counts uncompressed, and the pilot's bits compress worse in small groups.
@@ -83,7 +84,7 @@ def dry_run(prepared: Prepared) -> dict[str, Any]:
         "bounces": prepared.bounces,
         "light_resolution": prepared.resolution,
         "plan": rows_of_plan,
-        "planning_seconds": prepared.planning_seconds,
+        "planning_seconds": account.seconds("planning"),
         "predicted": {"rays": int(rays), "seconds": seconds, "bytes": int(packed) + _raw_bytes(geometry, points)},
         "notes": list(geometry.notes),
     }

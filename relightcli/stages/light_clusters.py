@@ -28,6 +28,8 @@ from relightcli.core.transport.light_vectors import transpose_bits
 from relightcli.core.transport.receivers import receiver_areas
 from relightcli.errors import InputError, StoreError
 from relightcli.run import blocks as run
+from relightcli.run.accounting import Account, Meter
+from relightcli.stages.budget import summary
 from relightcli.stages.cluster import copy_arrays
 from relightcli.stages.light_cluster_job import SCRATCH, ClusterJob, ClusterWorker, as_cell
 from relightcli.stages.lighting import SHINY, LightingStore, need_still
@@ -67,10 +69,11 @@ class Config:
 
 def cluster_lights(config: Config) -> dict[str, Any]:
     """Runs the stage; returns a summary. Raises InputError, StoreError, OSError."""
-    started = time.perf_counter()
+    started, account = time.perf_counter(), Account()
     epsilon = _check(config)
     need_output(config.output)
-    lighting = LightingStore(config.store, config.workers)
+    with account.step("reading"):
+        lighting = LightingStore(config.store, config.workers)
     need_still(lighting.store)
     if lighting.store.kind != "transfer":
         raise StoreError(f"{config.store}: expected a store of kind transfer, found {lighting.store.kind}.")
@@ -105,22 +108,25 @@ def cluster_lights(config: Config) -> dict[str, Any]:
         left_out = (
             ("direct/", "bounce/") if view is None and _may_shine(lighting) else ("visibility/", "direct/", "bounce/")
         )
-        copy_arrays(lighting.store, writer, [n for n in lighting.store.names() if not n.startswith(left_out)])
+        with account.step("copying"):
+            copy_arrays(lighting.store, writer, [n for n in lighting.store.names() if not n.startswith(left_out)])
         _put_receivers(writer, lighting, view)
         words = -(-len(lighting) // 64)
         base = np.lib.format.open_memmap(
             writer.partial_path / SCRATCH, "w+", np.uint64, (6 * lighting.resolution**2, words)
         )
-        transpose_bits(lighting.blocks(), base)
-        base.flush()
+        with account.step("reading"):
+            transpose_bits(lighting.blocks(), base)
+            base.flush()
         shadows = "shadows" in lighting.store.settings["effects"]
         job = ClusterJob(
             str(writer.partial_path), config.resolution, epsilon, config.criterion, shadows, view is not None
         )
-        if config.lights is None and config.seconds is None:
-            leaves = _refine(job, writer, config)
-        else:
-            leaves = _spend(job, writer, config)
+        with account.step("clusters"):
+            if config.lights is None and config.seconds is None:
+                leaves = _refine(job, writer, config)
+            else:
+                leaves = _spend(job, writer, config)
         leaves = _in_order(leaves, config.resolution)
         cells = np.array(leaves, np.int32)
         writer.put("light_clusters/cell", cells, dims=("cluster", "face_row0_row1_column0_column1"))
@@ -131,19 +137,20 @@ def cluster_lights(config: Config) -> dict[str, Any]:
             units="sr",
         )
         _create_outputs(writer, len(leaves), len(lighting), _lobe_count(writer) if view is not None else 0)
-        run.run_blocks(
-            job,
-            run.split("fraction", len(leaves), CLUSTERS),
-            writer,
-            workers=config.workers,
-            label="clusters",
-            quiet=config.quiet,
-        )
+        with account.step("clusters"):
+            run.run_blocks(
+                job,
+                run.split("fraction", len(leaves), CLUSTERS),
+                writer,
+                workers=config.workers,
+                label="clusters",
+                quiet=config.quiet,
+            )
         if "check" not in writer.done:
             writer.record("check", job.open().check(leaves, config.seed))
         run.close_worker()
         del base
-        writer.commit({"seconds": time.perf_counter() - started, "resumed": resumed, "workers": config.workers})
+        writer.commit(summary(account, started, resumed, config.workers, lighting.store))
     return _summary(config, started, resumed)
 
 
@@ -249,7 +256,7 @@ def _refine(job: ClusterJob, writer: formats.Writer, config: Config) -> list[Cel
     level, leaves = quadtree.roots(config.resolution), []
     if "roots" not in writer.done:
         worker = job.open()
-        clock = time.perf_counter()
+        meter = Meter()
         for _ in range(SPLIT_LEVEL):
             inner = [cell for cell in level if not worker.accepts(cell)]
             leaves += [cell for cell in level if cell not in set(inner)]
@@ -257,7 +264,7 @@ def _refine(job: ClusterJob, writer: formats.Writer, config: Config) -> list[Cel
         writer.record(
             "roots",
             {
-                "seconds": time.perf_counter() - clock,
+                **meter.read(),
                 "rays": float(worker.vectors.rays),
                 "leaves": leaves,
                 "cells": level,
@@ -292,10 +299,9 @@ def _spend(job: ClusterJob, writer: formats.Writer, config: Config) -> list[Cell
         block = f"round/{number:06d}"
         if block not in writer.done:
             worker = worker or job.open()
-            clock, rays = time.perf_counter(), worker.vectors.rays
+            meter, rays = Meter(), worker.vectors.rays
             found = [worker.worst(cell) for cell in fresh]
-            seconds = time.perf_counter() - clock
-            writer.record(block, {"seconds": seconds, "rays": float(worker.vectors.rays - rays), "errors": found})
+            writer.record(block, {**meter.read(), "rays": float(worker.vectors.rays - rays), "errors": found})
         known = next(b for b in writer.blocks if b["id"] == block)
         spent += known["seconds"]
         errors |= dict(zip(fresh, known["errors"], strict=True))

@@ -37,6 +37,7 @@ SAMPLES = 8  # paths a pixel, in each of the two runs
 TURN = 12.0  # degrees about the upright axis from a camera of the scene to a view of the check
 MORE = 3  # interreflections that the truth has beyond the store's
 MOST_VIEWS = 2
+HOPELESS, GAIN = 2.0, 0.1
 
 Sky = NDArray[np.float32]
 
@@ -282,7 +283,8 @@ def trial(
     most: float,
     seed: int,
 ) -> list[tuple[int, Share]]:
-    """The error of direct light by resolution of the light, from coarse to fine, until it is at most `most`.
+    """The error of direct light by resolution of the light, from coarse to fine, until it is at most `most`, or there
+    is no hope of that: it is HOPELESS times that, and two resolutions more have not taken a GAIN of it away.
 
     geometry: the mesh that the receivers `points` are on; only receivers that the strips need are traced."""
     tracer = Tracer(geometry.positions, geometry.faces)
@@ -296,6 +298,7 @@ def trial(
     for resolution in resolutions:
         lighting = Trial(judge.scene, geometry, points.at(rows), buried[rows], tracer, resolution, refine, seed)
         out.append((resolution, judge.error(lighting, strips, skies, 0, 0, edits=False)))
-        if out[-1][1].share <= most:
+        share = out[-1][1].share
+        if share <= most or (len(out) > 2 and share > max(HOPELESS * most, (1.0 - GAIN) * out[-3][1].share)):
             break
     return out

@@ -11,8 +11,10 @@ import relight_formats as formats
 from relightcli import __version__
 from relightcli.adapters.files import need_output
 from relightcli.run import blocks as run
+from relightcli.run.accounting import Account
 from relightcli.scene.build import scene_to_json
 from relightcli.scene.model import Geometry
+from relightcli.stages.budget import summary
 from relightcli.stages.dry_run import dry_run
 from relightcli.stages.fields import describe, put_fields
 from relightcli.stages.inputs import scene_inputs
@@ -30,11 +32,11 @@ WRONG_BITS = 1e-3  # share of wrong bits above which the user is told
 
 def precompute(config: Config) -> dict[str, Any]:
     """Runs the stage; returns a summary for the user. Raises the errors of `relightcli.errors` and OSError."""
-    started = time.perf_counter()
+    started, account = time.perf_counter(), Account()
     need_output(config.output)
-    prepared = prepare(config)
+    prepared = prepare(config, account)
     if config.dry_run:
-        return dry_run(prepared)
+        return dry_run(prepared, account)
     scene, source, geometry, moving = prepared.scene, prepared.source, prepared.geometry, prepared.moving
     writer = formats.begin(
         config.output,
@@ -48,7 +50,8 @@ def precompute(config: Config) -> dict[str, Any]:
         return {"store": str(config.output), "status": "up to date", "notes": list(geometry.notes)}
     with writer:
         resumed = bool(writer.done)
-        receivers, buried, starts = prepared.receivers()
+        with account.step("receivers"):
+            receivers, buried, starts = prepared.receivers()
         points = receivers.points if isinstance(receivers, PixelReceivers) else receivers
         if moving is not None:
             writer.set_attrs({"fields": describe(moving, scene, starts)})
@@ -60,13 +63,14 @@ def precompute(config: Config) -> dict[str, Any]:
                 "nothing_blocks": config.effects == "auto" and not prepared.shadows,
             }
         )
-        put_geometry(writer, geometry)
-        put_rigs(writer, geometry)
-        if geometry is not source:
-            writer.put("source/face", source.faces, dims=("face", "corner"))
-        put_receivers(writer, receivers, buried)
-        if prepared.bounce_cells and geometry.textures:
-            put_vertex_colours(writer, geometry)
+        with account.step("scene"):
+            put_geometry(writer, geometry)
+            put_rigs(writer, geometry)
+            if geometry is not source:
+                writer.put("source/face", source.faces, dims=("face", "corner"))
+            put_receivers(writer, receivers, buried)
+            if prepared.bounce_cells and geometry.textures:
+                put_vertex_colours(writer, geometry)
         job = VisibilityJob(
             str(writer.partial_path),
             prepared.resolution,
@@ -84,42 +88,39 @@ def precompute(config: Config) -> dict[str, Any]:
             starts,
             prepared.posed,
         )
-        create_outputs(writer, job, len(receivers))
-        run.run_blocks(
-            job,
-            run.split("visibility", len(receivers), block_size(prepared.resolution)),
-            writer,
-            workers=config.workers,
-            label="visibility",
-            quiet=config.quiet,
-        )
-        run.close_worker()
-        if moving is not None:
-            put_fields(writer, moving, scene, config.fields, config.workers, config.quiet)
-        if "pose" in prepared.simulated:
-            simulate_poses(
+        with account.step("visibility"):
+            create_outputs(writer, job, len(receivers))
+            run.run_blocks(
+                job,
+                run.split("visibility", len(receivers), block_size(prepared.resolution)),
                 writer,
-                scene,
-                geometry,
-                config.pose_frames,
-                config.pose_order,
-                config.pose_directions,
-                config.pose_surroundings,
-                config.workers,
-                config.quiet,
+                workers=config.workers,
+                label="visibility",
+                quiet=config.quiet,
             )
+            run.close_worker()
+        if moving is not None:
+            with account.step("fields"):
+                put_fields(writer, moving, scene, config.fields, config.workers, config.quiet)
+        if "pose" in prepared.simulated:
+            with account.step("pose"):
+                simulate_poses(
+                    writer,
+                    scene,
+                    geometry,
+                    config.pose_frames,
+                    config.pose_order,
+                    config.pose_directions,
+                    config.pose_surroundings,
+                    config.workers,
+                    config.quiet,
+                )
         if prepared.promise is not None:
-            keep_promise(
-                config, prepared.promise, prepared.resolution, scene, source, geometry, receivers, buried, writer
-            )
-        writer.commit(
-            {
-                "seconds": time.perf_counter() - started,
-                "planning_seconds": prepared.planning_seconds,
-                "resumed": resumed,
-                "workers": config.workers,
-            }
-        )
+            with account.step("check"):
+                keep_promise(
+                    config, prepared.promise, prepared.resolution, scene, source, geometry, receivers, buried, writer
+                )
+        writer.commit(summary(account, started, resumed, config.workers))
     return _summary(config, started, resumed, geometry)
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, cast
+import math
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from relightcli.plan import pilot
 from relightcli.scene.model import Camera, Geometry, Scene
 from relightcli.stages.lighting import LightingStore
 from relightcli.stages.measured_error import (
+    GAIN,
     MORE,
     Draft,
     Judge,
@@ -84,6 +86,14 @@ def try_resolutions(
     )
 
 
+def choose(tried: list[tuple[int, pilot.Share]], promise: float) -> int:
+    """The coarsest resolution whose direct light is near enough; where none is, the coarsest that is as good as any:
+    what is wrong then does not come from the resolution, and a finer one would only cost."""
+    least = min(share.share for _, share in tried)
+    most = max(DIRECT * promise, (1.0 + GAIN) * least)
+    return next(resolution for resolution, share in tried if share.share <= most)
+
+
 def keep_promise(
     config: Config,
     promise: float,
@@ -102,7 +112,9 @@ def keep_promise(
     skies = check_skies()
     bounces = lighting.bounces
     found = judge.error(lighting, strips, skies, bounces, bounces + MORE, edits=True)
-    measured = {"share": found.share, "bound": found.bound, "where": found.where}
+    measured: dict[str, Any] = {"share": found.share, "where": found.where}
+    if math.isfinite(found.bound):  # else the two runs do not tell
+        measured["bound"] = found.bound
     writer.set_attrs({"measured_error": {**measured, "tolerance": promise}})
     if found.share <= promise or config.allow_miss:
         return
