@@ -37,6 +37,7 @@ SAMPLES = 8  # paths a pixel, in each of the two runs
 TURN = 12.0  # degrees about the upright axis from a camera of the scene to a view of the check
 MORE = 3  # interreflections that the truth has beyond the store's
 MOST_VIEWS = 2
+GLOW = 10.0  # degrees
 HOPELESS, GAIN = 2.0, 0.1
 
 Sky = NDArray[np.float32]
@@ -49,7 +50,20 @@ def check_skies() -> dict[str, Sky]:
         "sun at 25 degrees": sky_latlong(25.0, 100.0, size=size),
         "sun at 50 degrees": sky_latlong(50.0, 230.0, size=size),
         "overcast": sky_latlong(30.0, size=size, overcast=True),
+        "glow": _glow(size),
     }
+
+
+def _glow(size: tuple[int, int]) -> Sky:
+    """A dim sky with a bright spot of GLOW low on one side: too narrow for coarse light and coarse meshes under lobes,
+    too wide to be taken apart as a sun is."""
+    height, width = size
+    latitude = (math.pi * (0.5 - (np.arange(height) + 0.5) / height))[:, None]
+    longitude = math.pi * (1.0 - 2.0 * (np.arange(width) + 0.5) / width)
+    low, side = math.radians(6.0), math.radians(-30.0)
+    cosine = np.sin(latitude) * math.sin(low) + np.cos(latitude) * math.cos(low) * np.cos(longitude - side)
+    spot = np.exp(-((np.arccos(np.clip(cosine, -1.0, 1.0)) / math.radians(GLOW)) ** 2))[..., None]
+    return (0.1 + spot * np.array([8.0, 4.0, 1.5])).astype(np.float32)  # type: ignore[no-any-return]
 
 
 def check_views(scene: Scene, geometry: Geometry, only: str | None) -> list[Camera]:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import time
 from typing import Any
 
-import numpy as np
-
 import relight_formats as formats
 from relightcli import __version__
 from relightcli.adapters.files import need_output
@@ -18,13 +16,12 @@ from relightcli.stages.budget import summary
 from relightcli.stages.dry_run import dry_run
 from relightcli.stages.fields import describe, put_fields
 from relightcli.stages.inputs import scene_inputs
+from relightcli.stages.lay_out import make_job, put_scene
 from relightcli.stages.pose_job import simulate_poses
 from relightcli.stages.precompute_config import Config
 from relightcli.stages.prepare import Prepared, prepare
 from relightcli.stages.promise import keep_promise
-from relightcli.stages.receiver_setup import PixelReceivers, put_geometry, put_receivers, put_vertex_colours
-from relightcli.stages.rig_store import put_rigs
-from relightcli.stages.visibility_job import VisibilityJob, block_size, create_outputs
+from relightcli.stages.visibility_job import block_size, create_outputs
 
 KIND = "transfer"
 WRONG_BITS = 1e-3  # share of wrong bits above which the user is told
@@ -52,7 +49,6 @@ def precompute(config: Config) -> dict[str, Any]:
         resumed = bool(writer.done)
         with account.step("receivers"):
             receivers, buried, starts = prepared.receivers()
-        points = receivers.points if isinstance(receivers, PixelReceivers) else receivers
         if moving is not None:
             writer.set_attrs({"fields": describe(moving, scene, starts)})
         writer.set_attrs(
@@ -64,35 +60,14 @@ def precompute(config: Config) -> dict[str, Any]:
             }
         )
         with account.step("scene"):
-            put_geometry(writer, geometry)
-            put_rigs(writer, geometry)
-            if geometry is not source:
-                writer.put("source/face", source.faces, dims=("face", "corner"))
-            put_receivers(writer, receivers, buried)
-            if prepared.bounce_cells and geometry.textures:
-                put_vertex_colours(writer, geometry)
-        job = VisibilityJob(
-            str(writer.partial_path),
-            prepared.resolution,
-            config.refine,
-            prepared.shadows,
-            config.basis,
-            config.coefficients,
-            config.tolerance or 0.0,
-            config.sh_order,
-            config.seed,
-            tuple(scene.lights.values()),
-            prepared.bounce_cells,
-            int(np.count_nonzero(points.vertex < 0)),
-            () if moving is None else tuple(geometry.object_names.index(m.mesh.name) for m in moving.movers),
-            starts,
-            prepared.posed,
-        )
+            put_scene(writer, prepared, receivers, buried)
+        job = make_job(prepared, str(writer.partial_path), receivers, starts)
         with account.step("visibility"):
-            create_outputs(writer, job, len(receivers))
+            size = block_size(prepared.resolution)
+            create_outputs(writer, job, len(receivers), size)
             run.run_blocks(
                 job,
-                run.split("visibility", len(receivers), block_size(prepared.resolution)),
+                run.split("visibility", len(receivers), size),
                 writer,
                 workers=config.workers,
                 label="visibility",
@@ -118,7 +93,16 @@ def precompute(config: Config) -> dict[str, Any]:
         if prepared.promise is not None:
             with account.step("check"):
                 keep_promise(
-                    config, prepared.promise, prepared.resolution, scene, source, geometry, receivers, buried, writer
+                    config,
+                    prepared.promise,
+                    prepared.resolution,
+                    prepared.finer_helps,
+                    scene,
+                    source,
+                    geometry,
+                    receivers,
+                    buried,
+                    writer,
                 )
         writer.commit(summary(account, started, resumed, config.workers))
     return _summary(config, started, resumed, geometry)

@@ -66,6 +66,11 @@ class Prepared:
         return "shadows" in self.simulated
 
     @property
+    def finer_helps(self) -> bool:
+        """Whether a finer resolution of light could bring the error down, as far as was tried."""
+        return not self.tried or self.resolution == self.tried[-1][0]
+
+    @property
     def posed(self) -> tuple[int, ...]:
         """Objects that will stand otherwise when pictures are made: they block nothing for the receivers of others."""
         if "pose" not in self.simulated:
@@ -84,7 +89,7 @@ class Prepared:
         Pixels look at the `source`: they are the same, and lit the same, with and without interreflections.
         """
         config, scene, geometry, both = self.config, self.scene, self.geometry, self.both
-        move_aside = self.shadows and not config.dry_run
+        move_aside = self.shadows
         if self.moving is not None:
             still = without(self.moving, geometry)
             vertices, buried = on_vertices(still, both), np.zeros(0, bool)

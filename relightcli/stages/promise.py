@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -18,12 +19,14 @@ from relightcli.stages.lighting import LightingStore
 from relightcli.stages.measured_error import (
     GAIN,
     MORE,
+    STRIP,
     Draft,
     Judge,
     Strips,
     check_skies,
     check_views,
     pixel_strips,
+    rows_of,
     trial,
     vertex_strips,
 )
@@ -94,10 +97,24 @@ def choose(tried: list[tuple[int, pilot.Share]], promise: float) -> int:
     return next(resolution for resolution, share in tried if share.share <= most)
 
 
+def predict_check(config: Config, scene: Scene, source: Geometry, bounces: int) -> float:
+    """Seconds that `keep_promise` will trace, from a few rows of one of its pictures."""
+    judge = Judge(scene, source, Tracer(source.positions, source.faces))
+    cameras, skies = check_views(scene, source, _camera_of(config)), check_skies()
+    middle = cameras[0].size[1] // 2
+    rows = (max(0, middle - STRIP // 2), middle + max(1, STRIP // 2))
+    clock = time.perf_counter()
+    judge.trace(Strips(cameras[0], [rows], []), next(iter(skies.values())), scene.materials, bounces + MORE, 0)
+    taken = time.perf_counter() - clock
+    pixels = sum(sum(b - a for a, b in rows_of(c)) * c.size[0] for c in cameras)
+    return 2 * len(skies) * taken * pixels / ((rows[1] - rows[0]) * cameras[0].size[0])
+
+
 def keep_promise(
     config: Config,
     promise: float,
     resolution: int,
+    finer_helps: bool,
     scene: Scene,
     source: Geometry,
     geometry: Geometry,
@@ -105,7 +122,10 @@ def keep_promise(
     buried: NDArray[np.bool_] | None,
     writer: formats.Writer,
 ) -> None:
-    """Measures the error of what was made and keeps it with it; raises NumericalError where it is too large."""
+    """Measures the error of what was made and keeps it with it; raises NumericalError where it is too large.
+
+    finer_helps: it is not known that a finer resolution of light would change nothing.
+    """
     lighting = LightingStore(cast("formats.Store", Draft(writer)), config.workers)
     judge = Judge(scene, source, Tracer(source.positions, source.faces))
     strips = _strips(scene, geometry, receivers, buried, check_views(scene, source, _camera_of(config)))
@@ -123,10 +143,11 @@ def keep_promise(
         knob = f"--bounces {bounces + 1} or a finer --bounce-resolution"
     elif config.receivers == "vertices":
         knob = f"--receivers pixels:{next(iter(scene.cameras), 'CAMERA')}, or a finer mesh"
-    elif resolution < RESOLUTIONS[-1]:
+    elif resolution < RESOLUTIONS[-1] and finer_helps:
         knob = f"--light-resolution {2 * resolution}"
     else:
-        knob = f"--pixel-grid {min(config.pixel_grid + 1, MOST_PIXEL_GRID)} or --light-resolution {2 * resolution}"
+        grid = min(config.pixel_grid + 1, MOST_PIXEL_GRID)
+        knob = f"--pixel-grid {grid}" + (f" or --light-resolution {2 * resolution}" if finer_helps else "")
     raise NumericalError(
         f"{config.output}: the error is {found.share:.2%} ({found.where}; of direct light {direct.share:.2%}), more "
         f"than the tolerance of {promise:.2%}. What would help: {knob}. The work is kept in "

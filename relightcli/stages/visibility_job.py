@@ -236,9 +236,10 @@ def block_size(resolution: int) -> int:
     return min(size, 4096)
 
 
-def create_outputs(writer: formats.Writer, job: VisibilityJob, count: int) -> None:
-    """The arrays that the job's blocks fill, `count` receivers long, a chunk per block (of `direct/dense` several)."""
-    resolution, size = job.resolution, block_size(job.resolution)
+def create_outputs(writer: formats.Writer, job: VisibilityJob, count: int, size: int) -> None:
+    """The arrays that the job's blocks fill, `count` receivers long, a chunk per block of `size` (of `direct/dense`
+    several)."""
+    resolution = job.resolution
     if job.lights:
         n = len(job.lights) * POINTS_PER_LIGHT // 8
         writer.array(

@@ -18,9 +18,12 @@ from relightcli.stages.cluster import cluster
 from relightcli.stages.factorize import Config as FactorizeConfig
 from relightcli.stages.factorize import factorize
 from relightcli.stages.inspect import inspect
+from relightcli.stages.precompute import precompute
+from relightcli.stages.precompute_config import Config as PrecomputeConfig
 from tests.core.transport.scenes import lambert, sphere, square
 from tests.stages.scene_files import make_store, write_scene
 
+ASKED = {"effects": "all", "bounces": 2, "light_resolution": 16, "bounce_resolution": 8}
 LAMP = '[lights.lamp]\nshape = "sphere"\ncenter = [0, 2, 0]\nradius = 0.1\nradiance = [20, 20, 18]\n'
 
 
@@ -29,7 +32,7 @@ def transfer(tmp_path_factory):
     parts = {"ground": square(3, material=lambert(0.5)), "ball": sphere(0.4, (0, 0.5, 0), rings=8)}
     scene = write_scene(tmp_path_factory.mktemp("budget"), parts, [], {}, more=LAMP)
     # Two processes: blocks are counted where they are done.
-    return make_store(scene, effects="all", bounces=2, light_resolution=16, bounce_resolution=8, workers=2)
+    return make_store(scene, **ASKED, workers=2)
 
 
 def by_step(store):
@@ -85,20 +88,30 @@ def test_later_stages_tell_what_came_before_and_what_they_leave_out(transfer, tm
     assert groups["light-basis"]["cpu_seconds"] > 0
 
 
-def test_costs_are_no_content(transfer, tmp_path):
-    """Two runs cost differently and are the same store."""
-    again = make_store(
-        transfer.parent / "scene.toml",
-        "again.zarr",
-        effects="all",
-        bounces=2,
-        light_resolution=16,
-        bounce_resolution=8,
-        workers=1,
-    )
+def test_costs_are_no_content_and_are_predicted(transfer, tmp_path):
+    """Two runs cost differently and are the same store; a dry run knows before what it will be."""
+    scene = transfer.parent / "scene.toml"
+    again = make_store(scene, "again.zarr", **ASKED, workers=1)
     a, b = formats.open_store(transfer), formats.open_store(again)
     assert a.fingerprint == b.fingerprint
     assert a.summary["steps"] != b.summary["steps"]
+    told = precompute(PrecomputeConfig(scene, tmp_path / "no.zarr", **ASKED, workers=1, dry_run=True, quiet=True))
+    predicted = told["predicted"]
+    assert 1 / 1.2 <= predicted["bytes"] / on_disk(again) <= 1.2
+    # Runs of 64 receivers, a third of all, stand for the rest: shadows are nowhere else than there.
+    assert 1 / 1.2 <= predicted["rays"] / sum(b.get("rays", 0) for b in formats.open_store(again).blocks) <= 1.2
+    # Both take a second or two, whoever else uses the machine; tracing alone is a small part of it.
+    assert 1 / 4 <= predicted["seconds"] / b.summary["seconds"] <= 4
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bytes_of_what_is_convex_are_predicted(tmp_path):
+    """No ray is traced, and horizons are stored all the same."""
+    scene = write_scene(tmp_path / "scene", {"ball": sphere(0.4, (0, 0.5, 0), rings=24)}, [], {})
+    store = make_store(scene, effects="auto", bounces=None)
+    told = precompute(PrecomputeConfig(scene, tmp_path / "no.zarr", dry_run=True, quiet=True))
+    assert told["predicted"]["rays"] == 0
+    assert 1 / 1.2 <= told["predicted"]["bytes"] / on_disk(store) <= 1.2
 
 
 def test_what_is_left_out_after_the_last_interreflection_is_told():
