@@ -171,8 +171,9 @@ def _errors(store: formats.Store, found: dict[str, Row]) -> Iterator[tuple[str, 
 
 
 def _errors_of_transfer(store: formats.Store, found: dict[str, Row]) -> Iterator[tuple[str, str, float]]:
-    bounces_left_out = False
-    for decision in store.attrs.get("plan", []):
+    plan = store.attrs.get("plan", [])
+    bounces_left_out = any("rest" in decision for decision in plan)
+    for decision in plan:
         bounce = decision["effect"].endswith("-bounce")
         if not decision["simulate"] and "bound" in decision and not (bounce and bounces_left_out):
             yield "planning", f"at most, of {decision['effect']} left out", decision["bound"]

@@ -34,10 +34,11 @@ from relightcli.stages.lighting import LightingStore, together
 PIXELS = 2048  # of a picture that are compared, about
 STRIP = 4  # rows that are taken together, so that outlines are found
 SAMPLES = 8  # paths a pixel, in each of the two runs
-TURN = 12.0  # degrees about the upright axis from a camera of the scene to a view of the check
+TURN, LIFT = 12.0, 7.0  # degrees from a camera of the scene to a view of the check: round the target, and up
+STEEPEST = 80.0  # degrees above the target to which a view is lifted
 MORE = 3  # interreflections that the truth has beyond the store's
 MOST_VIEWS = 2
-GLOW = 10.0  # degrees
+GLOW = 8.0  # degrees
 HOPELESS, GAIN = 2.0, 0.1
 
 Sky = NDArray[np.float32]
@@ -55,29 +56,33 @@ def check_skies() -> dict[str, Sky]:
 
 
 def _glow(size: tuple[int, int]) -> Sky:
-    """A dim sky with a bright spot of GLOW low on one side: too narrow for coarse light and coarse meshes under lobes,
-    too wide to be taken apart as a sun is."""
+    """A dim sky with a bright ring above the horizon, of GLOW degrees, warm on one side: narrow enough to fall between
+    vertices that lobes show it at, too wide to be taken apart as a sun is."""
     height, width = size
-    latitude = (math.pi * (0.5 - (np.arange(height) + 0.5) / height))[:, None]
+    latitude = (180.0 * (0.5 - (np.arange(height) + 0.5) / height))[:, None]
     longitude = math.pi * (1.0 - 2.0 * (np.arange(width) + 0.5) / width)
-    low, side = math.radians(6.0), math.radians(-30.0)
-    cosine = np.sin(latitude) * math.sin(low) + np.cos(latitude) * math.cos(low) * np.cos(longitude - side)
-    spot = np.exp(-((np.arccos(np.clip(cosine, -1.0, 1.0)) / math.radians(GLOW)) ** 2))[..., None]
-    return (0.1 + spot * np.array([8.0, 4.0, 1.5])).astype(np.float32)  # type: ignore[no-any-return]
+    ring = np.exp(-(((latitude - 3.0) / GLOW) ** 2))[..., None]
+    warm = (0.5 + 0.5 * np.cos(longitude + 0.5))[:, None]
+    colour = warm * np.array([3.0, 1.5, 0.5]) + (1.0 - warm) * np.array([0.6, 0.8, 1.5])
+    return (0.1 + ring * colour).astype(np.float32)  # type: ignore[no-any-return]
 
 
 def check_views(scene: Scene, geometry: Geometry, only: str | None) -> list[Camera]:
-    """Views that nothing is chosen by: the scene's, turned; of a store of pixels the one that it is for."""
+    """Views that nothing is chosen by: the scene's, turned and lifted; of a store of pixels the one that it is for."""
     if only is not None:
         return [scene.cameras[only]]
     cameras = list(scene.cameras.values())[:MOST_VIEWS]
     if not cameras:
         return [replace(c, size=(64, 48)) for c in views([], geometry.positions, geometry.faces)[:MOST_VIEWS]]
-    c, s = math.cos(math.radians(TURN)), math.sin(math.radians(TURN))
     turned = []
     for camera in cameras:
         x, y, z = np.subtract(camera.eye, camera.target)
-        eye = np.add(camera.target, (c * x + s * z, y, c * z - s * x))
+        distance = math.hypot(x, y, z)
+        round_ = math.atan2(x, z) + math.radians(TURN)
+        up = math.asin(y / distance)
+        up = max(up, min(up + math.radians(LIFT), math.radians(STEEPEST)))
+        away = (math.sin(round_) * math.cos(up), math.sin(up), math.cos(round_) * math.cos(up))
+        eye = np.add(camera.target, distance * np.array(away))
         turned.append(replace(camera, eye=(float(eye[0]), float(eye[1]), float(eye[2]))))
     return turned
 
