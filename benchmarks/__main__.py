@@ -34,6 +34,7 @@ NAMES = (
     "clusters",
     "pose",
     "fields",
+    "promise",
 )
 PACKAGES = ("relightcli", "numpy", "numba", "zarr", "embreex", "mitsuba", "pyradiance")
 RESULTS = Path("build/bench.json")

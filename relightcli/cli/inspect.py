@@ -55,28 +55,12 @@ def _text(result: dict[str, Any]) -> str:
         f"  effect    {row['effect']}: {'simulated' if row['simulate'] else 'skipped'} ({row['evidence']})"
         for row in result["plan"]
     ]
-    for effect, cost in result["cost"].items():
-        line = f"  cost      {effect}: {cost['blocks']} blocks, {cost.get('seconds', 0.0):.1f} s in workers"
-        if "rays" in cost:
-            line += f", {cost['rays'] / 1e6:.1f} million rays"
-        line += f", peak {size(cost['peak_bytes'])}"
-        lines.append(line)
-        if "relative_error" in cost:
-            lines.append(
-                f"  error     {effect}: {cost['relative_error']:.2%} of what vertices see, from "
-                f"{int(cost['vertices_checked'])} checks"
-            )
-        if "wrong_bits" in cost:
-            lines.append(
-                f"  error     {effect}: {cost['wrong_bits']:.1e} of bits wrong, from {int(cost['checked'])} checks"
-            )
+    for before in result["before"]:
+        lines += [f"  from {before['kind']}", *_budget(before["rows"])]
+    lines += _budget(result["budget"])
     for model in result.get("models", []):
         kind = f"{model['lobes']} lobes" if model["lobes"] else model["model"]
-        seen = "" if model["held_out"] is None else f", {model['held_out']['bands']:.1%} at held-out ones"
-        lines.append(
-            f"  error     visibility of {model['object']} by {kind}: {model['training']['bands']:.1%} at training "
-            f"frames{seen}"
-        )
+        lines.append(f"  model     visibility of {model['object']} by {kind}")
     for name, array in result["arrays"].items():
         shape = " x ".join(str(n) for n in array["shape"])
         lines.append(f"  array     {name:24} {array['dtype']:8} {shape:24} {size(array['bytes'])}")
@@ -87,3 +71,15 @@ def _text(result: dict[str, Any]) -> str:
 
 def _short(value: Any) -> str:
     return ",".join(str(v) for v in value) if isinstance(value, list) else str(value)
+
+
+def _budget(rows: list[dict[str, Any]]) -> list[str]:
+    """What every step cost, and the errors that it knows of."""
+    lines = ["  step             seconds   CPU s     Mrays       bytes        peak  error"]
+    for row in rows:
+        rays = f"{row['rays'] / 1e6:.1f}" if row["rays"] else ""
+        size, peak = (options.bytes_text(row[key]) if row[key] else "" for key in ("bytes", "peak_bytes"))
+        errors = "; ".join(f"{error['value']:.2g} {error['what']}" for error in row["errors"])
+        cells = f"{row['step']:14}{row['seconds']:10.2f}{row['cpu_seconds']:8.2f}{rays:>10}{size:>12}{peak:>12}"
+        lines.append(f"    {cells}  {errors}".rstrip())
+    return lines

@@ -28,13 +28,15 @@ MOST_PLANNED = 8  # interreflections, unless more are asked for
 
 @dataclass(frozen=True)
 class Decision:
-    """One row of the plan: what is done about an effect, and why; share and bound: of the light, if measured."""
+    """One row of the plan: what is done about an effect, and why; share and bound: of the light, if measured; rest: at
+    most what interreflections after the last that is simulated carry."""
 
     effect: str
     simulate: bool
     evidence: str
     share: float | None = None
     bound: float | None = None
+    rest: float | None = None
 
 
 class Pilot(Protocol):
@@ -163,7 +165,9 @@ def _bounce(name: str, number: int, tails: Sequence[Share], bounces: int, allowe
         evidence += f"; {bounces} interreflections are simulated"
         if bounces < len(tails):
             evidence += f", the rest carries at most {tails[bounces].bound:.2%}"
-    return Decision(name, bounces >= number, evidence, tail.share, tail.bound)
+    last = number == min(bounces, max(BOUNCES.values())) and bounces < len(tails)
+    rest = tails[bounces].bound if last else None
+    return Decision(name, bounces >= number, evidence, tail.share, tail.bound, rest)
 
 
 def _text(share: Share, allowed: float) -> str:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import os
-import resource
 import signal
 import sys
 import threading
@@ -23,6 +22,7 @@ from types import FrameType
 from typing import Any, Protocol
 
 from relightcli.errors import SystemFault
+from relightcli.run.accounting import Meter
 
 RETRIES = 2  # new worker pools after one broke without finishing a single block
 PATIENCE = 5.0  # seconds that workers get to leave before they are killed
@@ -207,12 +207,8 @@ def run_one(job: Job, block: Block) -> Info:
     if _opened is None or _opened[0] != job:
         _opened = None
         _opened = (job, job.open())
-    wall, cpu = time.perf_counter(), time.process_time()
-    info = _opened[1].run(block)
-    info["seconds"] = time.perf_counter() - wall
-    info["cpu_seconds"] = time.process_time() - cpu
-    info["peak_bytes"] = float(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
-    return info
+    meter = Meter()
+    return _opened[1].run(block) | meter.read()
 
 
 def close_worker() -> None:

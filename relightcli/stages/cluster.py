@@ -21,6 +21,8 @@ from relightcli.core.brdf.transport_basis import FUNCTIONS
 from relightcli.core.compress.cpca import cpca
 from relightcli.core.compress.tucker import gram_spectrum
 from relightcli.errors import InputError, StoreError
+from relightcli.run.accounting import Account, Meter
+from relightcli.stages.budget import summary
 from relightcli.stages.lighting import LightingStore, need_still
 from relightcli.stages.transfer_setup import BLOCK, CELLS, TransferSetup, coarse_cells
 
@@ -51,11 +53,12 @@ class Config:
 
 def cluster(config: Config) -> dict[str, Any]:
     """Runs the stage; returns a summary. Raises InputError, StoreError, NumericalError, OSError."""
-    started = time.perf_counter()
+    started, account = time.perf_counter(), Account()
     if not 0.0 < config.tolerance < 1.0:
         raise InputError(f"--tolerance: expected more than 0 and less than 1; found {config.tolerance}")
     need_output(config.output)
-    lighting = LightingStore(config.store, config.workers)
+    with account.step("reading"):
+        lighting = LightingStore(config.store, config.workers)
     need_still(lighting.store)
     if lighting.store.kind != "transfer":
         raise StoreError(f"{config.store}: expected a store of kind transfer, found {lighting.store.kind}.")
@@ -84,25 +87,26 @@ def cluster(config: Config) -> dict[str, Any]:
     with writer:
         resumed = bool(writer.done)
         writer.set_attrs(lighting.store.attrs)
-        copy_arrays(lighting.store, writer, lighting.store.names())
-        setup = TransferSetup(lighting, config.functions, config.workers)
+        with account.step("copying"):
+            copy_arrays(lighting.store, writer, lighting.store.names())
+        with account.step("reading"):
+            setup = TransferSetup(lighting, config.functions, config.workers)
         if "light-basis" not in writer.done:
-            clock = time.perf_counter()
-            basis, held_out = _light_basis(setup, config)
-            writer.put("light/basis", basis, dims=("light_cell", "light"))
-            writer.record("light-basis", {"seconds": time.perf_counter() - clock, "error": held_out})
+            with account.step("light-basis"):
+                meter = Meter()
+                basis, held_out = _light_basis(setup, config)
+                writer.put("light/basis", basis, dims=("light_cell", "light"))
+                writer.record("light-basis", {**meter.read(), "error": held_out})
         if "groups" not in writer.done:
-            clock = time.perf_counter()
-            rows = _sketch(setup, config)
-            found = cpca(rows, clusters, TERMS, config.seed)
-            label = split_large(rows, found.label, int(LARGEST * len(rows) / found.count) + 1)
-            writer.put("cluster/label", label, dims=("receiver",))
-            left = float(np.sqrt(found.residuals[-1] / found.norm2)) if found.norm2 else 0.0
-            writer.record(
-                "groups", {"seconds": time.perf_counter() - clock, "clusters": int(label.max()) + 1, "error": left}
-            )
-        seconds = time.perf_counter() - started
-        writer.commit({"seconds": seconds, "resumed": resumed, "workers": config.workers})
+            with account.step("groups"):
+                meter = Meter()
+                rows = _sketch(setup, config)
+                found = cpca(rows, clusters, TERMS, config.seed)
+                label = split_large(rows, found.label, int(LARGEST * len(rows) / found.count) + 1)
+                writer.put("cluster/label", label, dims=("receiver",))
+                left = float(np.sqrt(found.residuals[-1] / found.norm2)) if found.norm2 else 0.0
+                writer.record("groups", {**meter.read(), "clusters": int(label.max()) + 1, "error": left})
+        writer.commit(summary(account, started, resumed, config.workers, lighting.store))
     store = formats.open_store(config.output, KIND)
     info = {block["id"]: block for block in store.blocks}
     return {

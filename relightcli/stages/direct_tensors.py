@@ -6,7 +6,6 @@ diffuse factor alone. [Sun 2007, sec. 3.2, 4.1; `core.transport.direct_tensor`]
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import numpy as np
@@ -30,6 +29,7 @@ from relightcli.core.lights.prefiltered import prefiltered_sky
 from relightcli.core.shade.bright import Bright, add_highlights, add_irradiance, split_bright
 from relightcli.core.transport.direct_tensor import direct_light, direct_transfer, light_coefficients, shade_direct
 from relightcli.core.transport.lobe_visibility import add_lobes, lobe_visibility, table_side
+from relightcli.run.accounting import Meter
 from relightcli.stages.brdf_data import direct_model
 from relightcli.stages.lighting import LightingStore
 
@@ -89,7 +89,7 @@ def put_direct(writer: formats.Writer, lighting: LightingStore, keep: int, threa
             block = f"direct/{name}-{start}"
             if block in writer.done:
                 continue
-            clock = time.perf_counter()
+            meter = Meter()
             own = receivers[start : start + BLOCK]
             bits, normals = lighting.bits_of(own), lighting.normal[own]
             rows = slice(start, start + len(own))
@@ -97,7 +97,7 @@ def put_direct(writer: formats.Writer, lighting: LightingStore, keep: int, threa
             value[rows] = found.swapaxes(1, 2)
             for target, table in zip(lobes, lobe_visibility(bits, normals, degrees, threads), strict=True):
                 target[rows] = table
-            writer.record(block, {"seconds": time.perf_counter() - clock, "receivers": len(own)})
+            writer.record(block, {**meter.read(), "receivers": len(own)})
 
 
 class DirectTensors:

@@ -1,76 +1,65 @@
-"""Stage precompute --dry-run: the plan with what it would cost."""
+"""Stage precompute --dry-run: the plan with what it would cost.
+
+The stage is begun in a folder that is thrown away: the scene is written as it would be, and some receivers, in runs of
+neighbours spread evenly, see what they would see. What that took and left is scaled to all of them.
+"""
 
 from __future__ import annotations
 
+import subprocess
+import sys
+import tempfile
 import time
-import zlib
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from relightcli.adapters.rays import Tracer
-from relightcli.core.transport import visibility
-from relightcli.core.transport.hits import trace_hits
+import relight_formats as formats
+from relightcli import __version__
 from relightcli.core.transport.receivers import Receivers
+from relightcli.run import blocks as run
+from relightcli.run.accounting import Account
 from relightcli.scene.model import Geometry
 from relightcli.stages.fields import predict
+from relightcli.stages.lay_out import make_job, put_scene
 from relightcli.stages.pose_job import choose_frames
 from relightcli.stages.precompute_config import Config
 from relightcli.stages.prepare import Prepared
-from relightcli.stages.receiver_setup import PixelReceivers, surfaces_of
+from relightcli.stages.promise import predict_check
+from relightcli.stages.receiver_setup import PixelReceivers
+from relightcli.stages.visibility_job import VisibilityJob, block_size, create_outputs
 
-PILOT_GROUPS = 24  # groups of receivers that are traced
+RUN, RUNS = 64, 10  # receivers of a run; runs that are traced
+PARTS = {"shadows": ("trace", "visibility/"), "lights": ("light", "lights/"), "one-bounce": ("bounce", "bounce/")}
 
 
-def dry_run(prepared: Prepared) -> dict[str, Any]:
-    """The plan with its cost, predicted from a pilot of a few hundred receivers, and of samples of fields.
+def dry_run(prepared: Prepared, account: Account) -> dict[str, Any]:
+    """The plan with its cost, predicted from a pilot: of the whole run, planning included.
 
-    The bytes are an upper bound: the mesh counts uncompressed, and the pilot's bits compress worse in small groups.
+    Poses and fields: from the speed of rays, and uncompressed.
     """
-    config, geometry, cells = prepared.config, prepared.geometry, prepared.bounce_cells
-    receivers, _, _ = prepared.receivers()
+    config = prepared.config
+    with account.step("receivers"):
+        receivers, buried, starts = prepared.receivers()
     points = receivers.points if isinstance(receivers, PixelReceivers) else receivers
-    spent = {"shadows": np.zeros(3), "one-bounce": np.zeros(3)}  # rays, seconds, bytes
-    if prepared.shadows and len(points):
-        tracer = Tracer(geometry.positions, geometry.faces)
-        surfaces = surfaces_of(geometry, points, np.zeros(len(points), bool)) if cells else None
-        starts = np.linspace(0, max(0, len(points) - visibility.GROUP), PILOT_GROUPS + 1).astype(int)
-        pilot_receivers = 0
-        for k, start in enumerate(starts):
-            rows = slice(start, start + visibility.GROUP)
-            clock = time.perf_counter()
-            block = visibility.trace_visibility(
-                tracer, points.position[rows], points.normal[rows], prepared.resolution, config.refine, config.seed
-            )
-            seen = time.perf_counter()
-            hits = None
-            if surfaces is not None:
-                hits, more = trace_hits(
-                    tracer,
-                    surfaces,
-                    points.position[rows],
-                    points.normal[rows],
-                    block.bits,
-                    prepared.bounce_cells,
-                    start,
-                    0,
-                )
-            end = time.perf_counter()
-            if k:  # the first run pays for compilation
-                pilot_receivers += len(block.bits)
-                spent["shadows"] += block.rays, seen - clock, len(zlib.compress(block.bits.tobytes(), 1))
-                if hits is not None:
-                    spent["one-bounce"] += more, end - seen, len(zlib.compress(hits.tobytes(), 1))
-        for cost in spent.values():
-            cost *= len(points) / pilot_receivers
-            cost[1] /= max(1, config.workers)
+    with tempfile.TemporaryDirectory(prefix="relightcli-") as folder:
+        store = Path(folder) / "pilot.zarr"
+        with formats.begin(store, "transfer", settings={}, inputs={}, program=f"relightcli {__version__}") as writer:  # type: ignore[union-attr]
+            with account.step("scene"):
+                put_scene(writer, prepared, receivers, buried)
+            scene_bytes = _bytes(writer.partial_path)
+            spent, started = _pilot(writer, prepared, receivers, starts)
     if "pose" in prepared.simulated:
-        spent["pose"] = _pose_cost(config, geometry, spent["shadows"])
+        spent["pose"] = _pose_cost(config, prepared.geometry, spent["shadows"])
     if prepared.moving is not None:
         spent["fields"] = np.array(predict(prepared.moving))
         spent["fields"][1] /= max(1, config.workers)
-    rays, seconds, packed = np.sum(list(spent.values()), axis=0)
+    seconds = sum(cost["seconds"] for cost in account.steps.values()) + started
+    if prepared.promise is not None:
+        seconds += predict_check(config, prepared.scene, prepared.source, prepared.bounces)
+    total = np.sum(list(spent.values()), axis=0)
     rows_of_plan = prepared.plan_rows()
     for row in rows_of_plan:
         if row["simulate"] and row["effect"] in spent:
@@ -83,22 +72,62 @@ def dry_run(prepared: Prepared) -> dict[str, Any]:
         "bounces": prepared.bounces,
         "light_resolution": prepared.resolution,
         "plan": rows_of_plan,
-        "planning_seconds": prepared.planning_seconds,
-        "predicted": {"rays": int(rays), "seconds": seconds, "bytes": int(packed) + _raw_bytes(geometry, points)},
-        "notes": list(geometry.notes),
+        "planning_seconds": account.seconds("planning"),
+        "predicted": {
+            "rays": int(total[0]),
+            "seconds": float(seconds + total[1]),
+            "bytes": int(scene_bytes + total[2]),
+        },
+        "notes": list(prepared.geometry.notes),
     }
 
 
-def _raw_bytes(geometry: Geometry, points: Receivers) -> int:
-    arrays: list[NDArray[Any]] = [
-        geometry.positions,
-        geometry.normals,
-        geometry.uvs,
-        geometry.faces,
-        points.position,
-        points.normal,
-    ]
-    return sum(a.nbytes for a in [*arrays, *geometry.textures.values()])
+def _pilot(
+    writer: formats.Writer, prepared: Prepared, receivers: Receivers | PixelReceivers, starts: tuple[int, ...]
+) -> tuple[dict[str, NDArray[np.float64]], float]:
+    """Rays, seconds and bytes by part of the visibility of all receivers; and the seconds until the first is traced."""
+    count, workers = len(receivers), max(1, prepared.config.workers)
+    job = make_job(prepared, str(writer.partial_path), receivers, starts)
+    spent = {name: np.zeros(3) for name in ("shadows", "one-bounce", *(["lights"] if job.lights else []))}
+    if not count:
+        return spent, 0.0
+    blocks = -(-count // block_size(job.resolution))
+    begun = time.perf_counter()
+    if blocks > 1 and workers > 1:  # in other processes, which have to start
+        subprocess.run([sys.executable, "-c", f"import {VisibilityJob.__module__}"], check=True)
+    create_outputs(writer, job, count, RUN)
+    worker = job.open()
+    runs = -(-count // RUN)
+    chosen = np.unique(np.linspace(0, runs - 1, RUNS).round().astype(int))
+    worker.run(run.Block("first", int(chosen[0]) * RUN, min(count, (int(chosen[0]) + 1) * RUN)))
+    started = time.perf_counter() - begun
+    traced = 0
+    costs: dict[str, float] = {}
+    for number in chosen:
+        block = run.Block(f"run/{number}", int(number) * RUN, min(count, (int(number) + 1) * RUN))
+        traced += block.stop - block.start
+        clock = time.perf_counter()
+        found = worker.run(block)
+        # Light in another basis is no part of its own.
+        taken = sum(found.get(f"{part}_seconds", 0.0) for part, _ in PARTS.values())
+        found["rest_seconds"] = time.perf_counter() - clock - taken
+        costs = {key: costs.get(key, 0.0) + value for key, value in found.items()}
+    # The share of all receivers that the busiest process has.
+    share = min(1.0, -(-blocks // min(workers, blocks)) / blocks)
+    for name, (part, prefix) in PARTS.items():
+        if f"{part}_rays" in costs:
+            size = _bytes(writer.partial_path / prefix)
+            spent[name][:] = costs[f"{part}_rays"], share * costs[f"{part}_seconds"], size
+    if job.basis != "visibility":
+        spent["basis"] = np.array([0.0, share * costs["rest_seconds"], _bytes(writer.partial_path / "direct")])
+    for cost in spent.values():
+        cost *= count / traced
+    return spent, started
+
+
+def _bytes(folder: Path) -> int:
+    """Of the chunks of arrays below a folder."""
+    return sum(f.stat().st_size for f in folder.rglob("c*") if f.is_file() and f.name.split(".")[0] == "c")
 
 
 def _pose_cost(config: Config, geometry: Geometry, traced: NDArray[np.float64]) -> NDArray[np.float64]:

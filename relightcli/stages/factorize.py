@@ -22,6 +22,8 @@ from relightcli.core.compress.tucker import sequential_hosvd
 from relightcli.core.transport.direct_tensor import KEEP
 from relightcli.core.transport.transfer import Sources, light_fit
 from relightcli.errors import InputError, StoreError
+from relightcli.run.accounting import Account, Meter
+from relightcli.stages.budget import summary
 from relightcli.stages.cluster import copy_arrays
 from relightcli.stages.direct_tensors import put_direct
 from relightcli.stages.lighting import LightingStore
@@ -51,12 +53,13 @@ class Config:
 
 def factorize(config: Config) -> dict[str, Any]:
     """Runs the stage; returns a summary. Raises InputError, StoreError, NumericalError, OSError."""
-    started = time.perf_counter()
+    started, account = time.perf_counter(), Account()
     for name, value in (("--eigenvectors", config.eigenvectors), ("--light-rank", config.light_rank)):
         if value < 1:
             raise InputError(f"{name}: expected at least 1; found {value}")
     need_output(config.output)
-    lighting = LightingStore(config.store, config.workers)
+    with account.step("reading"):
+        lighting = LightingStore(config.store, config.workers)
     store = lighting.store
     if store.kind != "clusters":
         raise StoreError(f"{config.store}: expected a store of kind clusters, found {store.kind}; run cluster first.")
@@ -90,8 +93,10 @@ def factorize(config: Config) -> dict[str, Any]:
     with writer:
         resumed = bool(writer.done)
         writer.set_attrs(store.attrs)
-        copy_arrays(store, writer, [name for name in store.names() if name not in LEFT_OUT])
-        setup = TransferSetup(lighting, int(store.settings["functions"]), config.workers)
+        with account.step("copying"):
+            copy_arrays(store, writer, [name for name in store.names() if name not in LEFT_OUT])
+        with account.step("reading"):
+            setup = TransferSetup(lighting, int(store.settings["functions"]), config.workers)
         order = np.argsort(label, kind="stable")
         start = np.concatenate([[0], np.cumsum(np.bincount(label, minlength=clusters))]).astype(np.int64)
         writer.put("cluster/receiver", order.astype(np.int32), dims=("receiver",))
@@ -99,12 +104,15 @@ def factorize(config: Config) -> dict[str, Any]:
         basis: NDArray[np.float32] = read("light/basis")
         writer.put("one_bounce/basis", basis, dims=("light_cell", "light"))
         bands = int(store.settings["order"])
-        put_direct(writer, lighting, config.coefficients, config.workers)
+        with account.step("direct"):
+            put_direct(writer, lighting, config.coefficients, config.workers)
         if bounces:
-            _one_bounce(config, writer, setup, basis, order, start, bands)
+            with account.step("one-bounce"):
+                _one_bounce(config, writer, setup, basis, order, start, bands)
         if bounces > 1:
-            _two_bounces(config, writer, setup, order, start, bands)
-        writer.commit({"seconds": time.perf_counter() - started, "resumed": resumed, "workers": config.workers})
+            with account.step("two-bounce"):
+                _two_bounces(config, writer, setup, order, start, bands)
+        writer.commit(summary(account, started, resumed, config.workers, store))
     return _summary(config, started, resumed, notes)
 
 
@@ -139,7 +147,7 @@ def _one_bounce(
     sources = setup.sources(basis)
     _put_fit(writer, "one_bounce", setup, sources)
     for c in todo:
-        clock = time.perf_counter()
+        meter = Meter()
         rows = order[start[c] : start[c + 1]]
         tensor = setup.gather_rows(rows, sources, bands).reshape(len(rows), rest, lights)
         found = sequential_hosvd(tensor, (rank_v, None, rank_l))
@@ -154,7 +162,7 @@ def _one_bounce(
         writer.record(
             f"one-bounce/{c}",
             {
-                "seconds": time.perf_counter() - clock,
+                **meter.read(),
                 "receivers": len(rows),
                 "norm2": found.norm2,
                 "compression2": found.error2,
@@ -202,7 +210,7 @@ def _two_bounces(
     _put_fit(writer, "two_bounce", setup, lights)
     sources = setup.second_sources(lights, bands)
     for c in todo:
-        clock = time.perf_counter()
+        meter = Meter()
         rows = order[start[c] : start[c + 1]]
         tensor = setup.gather_rows(rows, sources, config.second_order).reshape(len(rows), size, 1)
         found = sequential_hosvd(tensor, (rank, None, None))
@@ -214,7 +222,7 @@ def _two_bounces(
         writer.record(
             f"two-bounce/{c}",
             {
-                "seconds": time.perf_counter() - clock,
+                **meter.read(),
                 "receivers": len(rows),
                 "norm2": found.norm2,
                 "compression2": found.error2,

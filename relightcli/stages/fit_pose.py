@@ -27,6 +27,8 @@ from relightcli.adapters.files import need_output
 from relightcli.core.pose.pose_model import MODELS, PoseModel, Report, Settings, fit_model
 from relightcli.core.pose.zh_lobes import MOST_LOBES
 from relightcli.errors import InputError, NumericalError, StoreError
+from relightcli.run.accounting import Account, Meter
+from relightcli.stages.budget import summary
 from relightcli.stages.cluster import copy_arrays
 
 KIND = "pose"
@@ -57,7 +59,7 @@ class Config:
 
 def fit_pose(config: Config) -> dict[str, Any]:
     """Runs the stage; returns a summary. Raises InputError, StoreError, NumericalError, OSError."""
-    started = time.perf_counter()
+    started, account = time.perf_counter(), Account()
     _check(config)
     need_output(config.output)
     store = formats.open_store(config.store)
@@ -88,13 +90,15 @@ def fit_pose(config: Config) -> dict[str, Any]:
         resumed = bool(writer.done)
         writer.set_attrs(store.attrs)
         left_out = {f"pose/{k}/{name}" for k in poses for name in LEFT_OUT}
-        copy_arrays(store, writer, [name for name in store.names() if name not in left_out])
-        for k, about in poses.items():
-            if f"fit/{k}" not in writer.done:
-                _fit(config, store, writer, k, about)
+        with account.step("copying"):
+            copy_arrays(store, writer, [name for name in store.names() if name not in left_out])
+        with account.step("pose"):
+            for k, about in poses.items():
+                if f"fit/{k}" not in writer.done:
+                    _fit(config, store, writer, k, about)
         kept = {block["id"].split("/")[1]: block for block in writer.blocks if block["id"].startswith("fit/")}
         writer.set_attrs({"pose_models": {k: kept[k]["model"] for k in poses}})
-        writer.commit({"seconds": time.perf_counter() - started, "resumed": resumed, "workers": config.workers})
+        writer.commit(summary(account, started, resumed, config.workers, store))
     return _summary(config, started, resumed)
 
 
@@ -115,7 +119,7 @@ def _check(config: Config) -> None:
 
 
 def _fit(config: Config, store: formats.Store, writer: formats.Writer, k: str, about: dict[str, Any]) -> None:
-    clock = time.perf_counter()
+    meter = Meter()
     read: Any = store.read
     features: NDArray[np.float64] = read(f"pose/{k}/features")
     visibility: NDArray[np.float32] = read(f"pose/{k}/visibility").astype(np.float32)
@@ -129,7 +133,7 @@ def _fit(config: Config, store: formats.Store, writer: formats.Writer, k: str, a
     writer.record(
         f"fit/{k}",
         {
-            "seconds": time.perf_counter() - clock,
+            **meter.read(),
             "frames": len(features),
             "vertices": visibility.shape[1],
             "model": {

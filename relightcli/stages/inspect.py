@@ -2,29 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
 import relight_formats as formats
 from relightcli.errors import StoreError
-
-SUMMED = (
-    "seconds",
-    "cpu_seconds",
-    "trace_seconds",
-    "bounce_seconds",
-    "rays",
-    "bounce_rays",
-    "bytes",
-    "checked",
-    "wrong",
-    "inferred",
-    "bits",
-    "vertices_checked",
-    "squared_error",
-    "squared_norm",
-)
+from relightcli.stages.budget import budget, costs
 
 
 def inspect(path: Path, verify: bool) -> dict[str, Any]:
@@ -59,7 +42,9 @@ def inspect(path: Path, verify: bool) -> dict[str, Any]:
             }
             for name, size in sizes.items()
         },
-        "cost": _cost(store.blocks),
+        "cost": costs(store.blocks),
+        "budget": budget(store),
+        "before": store.summary.get("before", []),
         "summary": store.summary,
     }
     models = [_model(block) for block in store.blocks if store.kind == "pose" and block["id"].startswith("fit/")]
@@ -80,21 +65,3 @@ def _model(block: dict[str, Any]) -> dict[str, Any]:
     """What a pose store says of the model of one object's visibility, with its errors."""
     report = block["report"]
     return {**block["model"], "training": report["training"], "held_out": report["held_out"]}
-
-
-def _cost(blocks: list[dict[str, Any]]) -> dict[str, Any]:
-    """Totals per effect, the part of a block's name before the slash."""
-    cost: dict[str, Any] = {}
-    for block in blocks:
-        effect = cost.setdefault(block["id"].partition("/")[0], {"blocks": 0, "peak_bytes": 0.0})
-        effect["blocks"] += 1
-        effect["peak_bytes"] = max(effect["peak_bytes"], block.get("peak_bytes", 0.0))
-        for name in SUMMED:
-            if name in block:
-                effect[name] = effect.get(name, 0.0) + block[name]
-    for effect in cost.values():
-        if effect.get("checked"):
-            effect["wrong_bits"] = effect["wrong"] / effect["checked"] * effect["inferred"] / effect["bits"]
-        if effect.get("squared_norm"):
-            effect["relative_error"] = math.sqrt(effect["squared_error"] / effect["squared_norm"])
-    return cost

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from relightcli.core.shade.cluster_sum import GROUP
 from relightcli.core.sphere import cube
 from relightcli.core.transport import light_clusters as measure
 from relightcli.core.transport.light_vectors import LightVectors
+from relightcli.run.accounting import Meter
 from relightcli.run.blocks import Block, Info
 
 JUDGED = 8_192  # receivers with lobes that a cell is judged by, about
@@ -201,7 +201,7 @@ class ClusterWorker:
 
     def check(self, leaves: list[Cell], seed: int) -> Info:
         """RMS error at lights that the clusters were not made from, uniform over the sphere."""
-        clock, rays = time.perf_counter(), self.vectors.rays
+        meter, rays = Meter(), self.vectors.rays
         d = np.random.default_rng(seed).normal(size=(CHECKS, 3))
         d /= np.linalg.norm(d, axis=1, keepdims=True)
         leaf = quadtree.leaves_at(quadtree.build_tree(leaves, self.job.resolution), d)
@@ -220,7 +220,7 @@ class ClusterWorker:
                 here = float(self.area @ error**2)
                 square, worst = square + here / CHECKS, max(worst, here)
         return {
-            "seconds": time.perf_counter() - clock,
+            **meter.read(),
             "rays": float(self.vectors.rays - rays),
             "error": math.sqrt(square),
             "worst": math.sqrt(worst),

@@ -29,6 +29,8 @@ from relightcli.core.transport.light_vectors import transpose_bits
 from relightcli.core.transport.receivers import receiver_areas
 from relightcli.errors import InputError, StoreError
 from relightcli.run import blocks as run
+from relightcli.run.accounting import Account, Meter
+from relightcli.stages.budget import summary
 from relightcli.stages.cluster import copy_arrays
 from relightcli.stages.light_cluster_job import DIFFUSE, LOBE, SCRATCH, ClusterJob, ClusterWorker, as_cell
 from relightcli.stages.lighting import SHINY, LightingStore, need_still
@@ -70,11 +72,12 @@ class Config:
 
 def cluster_lights(config: Config) -> dict[str, Any]:
     """Runs the stage; returns a summary. Raises InputError, StoreError, OSError."""
-    started = time.perf_counter()
+    started, account = time.perf_counter(), Account()
     epsilon = _check(config)
     need_output(config.output)
     run.need_scheduler(None if config.dry_run else config.scheduler)
-    lighting = LightingStore(config.store, config.workers)
+    with account.step("reading"):
+        lighting = LightingStore(config.store, config.workers)
     need_still(lighting.store)
     if lighting.store.kind != "transfer":
         raise StoreError(f"{config.store}: expected a store of kind transfer, found {lighting.store.kind}.")
@@ -109,28 +112,31 @@ def cluster_lights(config: Config) -> dict[str, Any]:
         left_out = (
             ("direct/", "bounce/") if view is None and _may_shine(lighting) else ("visibility/", "direct/", "bounce/")
         )
-        copy_arrays(lighting.store, writer, [n for n in lighting.store.names() if not n.startswith(left_out)])
+        with account.step("copying"):
+            copy_arrays(lighting.store, writer, [n for n in lighting.store.names() if not n.startswith(left_out)])
         _put_receivers(writer, lighting, view)
         words = -(-len(lighting) // 64)
         base = np.lib.format.open_memmap(
             writer.partial_path / SCRATCH, "w+", np.uint64, (6 * lighting.resolution**2, words)
         )
-        transpose_bits(lighting.blocks(), base)
-        base.flush()
+        with account.step("reading"):
+            transpose_bits(lighting.blocks(), base)
+            base.flush()
         shadows = "shadows" in lighting.store.settings["effects"]
         job = ClusterJob(
             str(writer.partial_path), config.resolution, epsilon, config.criterion, shadows, view is not None
         )
         budget = config.lights is not None or config.seconds is not None
         parts = (DIFFUSE, LOBE) if view is not None else (DIFFUSE,)
-        if view is not None and config.criterion == "rms" and not budget:
-            found = [_refine(replace(job, part=p), writer, config, f"{p}-") for p in ("diffuse", "lobes")]
-            leaves = quadtree.overlay(found[0], found[1], config.resolution)
-            trees = [_in_order(cells, config.resolution) for cells in found]
-        else:
-            leaves = _spend(job, writer, config) if budget else _refine(job, writer, config, "")
-            leaves = _in_order(leaves, config.resolution)
-            trees = [leaves] * len(parts)
+        with account.step("clusters"):
+            if view is not None and config.criterion == "rms" and not budget:
+                found = [_refine(replace(job, part=p), writer, config, f"{p}-") for p in ("diffuse", "lobes")]
+                leaves = quadtree.overlay(found[0], found[1], config.resolution)
+                trees = [_in_order(cells, config.resolution) for cells in found]
+            else:
+                leaves = _spend(job, writer, config) if budget else _refine(job, writer, config, "")
+                leaves = _in_order(leaves, config.resolution)
+                trees = [leaves] * len(parts)
         cells = np.array(leaves, np.int32)
         writer.put("light_clusters/cell", cells, dims=("cluster", CELL))
         writer.put(
@@ -146,20 +152,21 @@ def cluster_lights(config: Config) -> dict[str, Any]:
         blocks = []
         for name, tree in zip(("fraction", "lobe"), trees, strict=False):
             blocks += run.split(name, len(tree), CLUSTERS)
-        run.run_blocks(
-            job,
-            blocks,
-            writer,
-            workers=config.workers,
-            label="clusters",
-            quiet=config.quiet,
-            scheduler=config.scheduler,
-        )
+        with account.step("clusters"):
+            run.run_blocks(
+                job,
+                blocks,
+                writer,
+                workers=config.workers,
+                label="clusters",
+                quiet=config.quiet,
+                scheduler=config.scheduler,
+            )
         if "check" not in writer.done:
             writer.record("check", job.open().check(trees[0], config.seed))
         run.close_worker()
         del base
-        writer.commit({"seconds": time.perf_counter() - started, "resumed": resumed, "workers": config.workers})
+        writer.commit(summary(account, started, resumed, config.workers, lighting.store))
     return _summary(config, started, resumed)
 
 
@@ -270,13 +277,13 @@ def _refine(job: ClusterJob, writer: formats.Writer, config: Config, prefix: str
     top = f"{prefix}roots"
     if top not in writer.done:
         worker = job.open()
-        clock = time.perf_counter()
+        meter = Meter()
         for _ in range(SPLIT_LEVEL):
             inner = [cell for cell in level if not worker.accepts(cell)]
             leaves += [cell for cell in level if cell not in set(inner)]
             level = [part for cell in inner for part in quadtree.children(cell)]
-        seconds, rays = time.perf_counter() - clock, float(worker.vectors.rays)
-        writer.record(top, {"seconds": seconds, "rays": rays, "leaves": leaves, "cells": level})
+        rays = float(worker.vectors.rays)
+        writer.record(top, {**meter.read(), "rays": rays, "leaves": leaves, "cells": level})
     known = {block["id"]: block for block in writer.blocks}
     leaves = [as_cell(c) for c in known[top]["leaves"]]
     cells = [as_cell(c) for c in known[top]["cells"]]
@@ -307,10 +314,9 @@ def _spend(job: ClusterJob, writer: formats.Writer, config: Config) -> list[Cell
         block = f"round/{number:06d}"
         if block not in writer.done:
             worker = worker or job.open()
-            clock, rays = time.perf_counter(), worker.vectors.rays
+            meter, rays = Meter(), worker.vectors.rays
             found = [worker.worst(cell) for cell in fresh]
-            seconds = time.perf_counter() - clock
-            writer.record(block, {"seconds": seconds, "rays": float(worker.vectors.rays - rays), "errors": found})
+            writer.record(block, {**meter.read(), "rays": float(worker.vectors.rays - rays), "errors": found})
         known = next(b for b in writer.blocks if b["id"] == block)
         spent += known["seconds"]
         errors |= dict(zip(fresh, known["errors"], strict=True))

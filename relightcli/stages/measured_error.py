@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -34,9 +34,12 @@ from relightcli.stages.lighting import LightingStore, together
 PIXELS = 2048  # of a picture that are compared, about
 STRIP = 4  # rows that are taken together, so that outlines are found
 SAMPLES = 8  # paths a pixel, in each of the two runs
-TURN = 12.0  # degrees about the upright axis from a camera of the scene to a view of the check
+TURN, LIFT = 12.0, 7.0  # degrees from a camera of the scene to a view of the check: round the target, and up
+STEEPEST = 80.0  # degrees above the target to which a view is lifted
 MORE = 3  # interreflections that the truth has beyond the store's
 MOST_VIEWS = 2
+GLOW = 8.0  # degrees
+HOPELESS, GAIN = 2.0, 0.1
 
 Sky = NDArray[np.float32]
 
@@ -48,21 +51,38 @@ def check_skies() -> dict[str, Sky]:
         "sun at 25 degrees": sky_latlong(25.0, 100.0, size=size),
         "sun at 50 degrees": sky_latlong(50.0, 230.0, size=size),
         "overcast": sky_latlong(30.0, size=size, overcast=True),
+        "glow": _glow(size),
     }
 
 
+def _glow(size: tuple[int, int]) -> Sky:
+    """A dim sky with a bright ring above the horizon, of GLOW degrees, warm on one side: narrow enough to fall between
+    vertices that lobes show it at, too wide to be taken apart as a sun is."""
+    height, width = size
+    latitude = (180.0 * (0.5 - (np.arange(height) + 0.5) / height))[:, None]
+    longitude = math.pi * (1.0 - 2.0 * (np.arange(width) + 0.5) / width)
+    ring = np.exp(-(((latitude - 3.0) / GLOW) ** 2))[..., None]
+    warm = (0.5 + 0.5 * np.cos(longitude + 0.5))[:, None]
+    colour = warm * np.array([3.0, 1.5, 0.5]) + (1.0 - warm) * np.array([0.6, 0.8, 1.5])
+    return (0.1 + ring * colour).astype(np.float32)  # type: ignore[no-any-return]
+
+
 def check_views(scene: Scene, geometry: Geometry, only: str | None) -> list[Camera]:
-    """Views that nothing is chosen by: the scene's, turned; of a store of pixels the one that it is for."""
+    """Views that nothing is chosen by: the scene's, turned and lifted; of a store of pixels the one that it is for."""
     if only is not None:
         return [scene.cameras[only]]
     cameras = list(scene.cameras.values())[:MOST_VIEWS]
     if not cameras:
         return [replace(c, size=(64, 48)) for c in views([], geometry.positions, geometry.faces)[:MOST_VIEWS]]
-    c, s = math.cos(math.radians(TURN)), math.sin(math.radians(TURN))
     turned = []
     for camera in cameras:
         x, y, z = np.subtract(camera.eye, camera.target)
-        eye = np.add(camera.target, (c * x + s * z, y, c * z - s * x))
+        distance = math.hypot(x, y, z)
+        round_ = math.atan2(x, z) + math.radians(TURN)
+        up = math.asin(y / distance)
+        up = max(up, min(up + math.radians(LIFT), math.radians(STEEPEST)))
+        away = (math.sin(round_) * math.cos(up), math.sin(up), math.cos(round_) * math.cos(up))
+        eye = np.add(camera.target, distance * np.array(away))
         turned.append(replace(camera, eye=(float(eye[0]), float(eye[1]), float(eye[2]))))
     return turned
 
@@ -218,11 +238,12 @@ class _Memory(dict[str, Any]):
 
 @dataclass(frozen=True)
 class Judge:
-    """The path tracer on the scene as it is, before faces were cut."""
+    """The path tracer on the scene as it is, before faces were cut. traced: what it has found, to be asked again."""
 
     scene: Scene
     geometry: Geometry
     tracer: Tracer
+    traced: dict[tuple[Camera, str, int, int, int], NDArray[np.float64]] = field(default_factory=dict)
 
     def error(
         self,
@@ -248,7 +269,12 @@ class Judge:
                 materials = changes[number % len(changes)]
                 light = together(lighting.exit_radiance(sky, 0.0, materials, towards, active, None, bounces))
                 ours = view.pixels(light.diffuse, light.specular)
-                runs = [self.trace(view, sky, materials, truth, seed + run) for run in (0, 1)]
+                runs = []
+                for run in (seed, seed + 1):
+                    key = (view.camera, name, number % len(changes), truth, run)
+                    if key not in self.traced:
+                        self.traced[key] = self.trace(view, sky, materials, truth, run)
+                    runs.append(self.traced[key])
                 where = f"camera {view.camera.name}, {name}{', edited' if number % len(changes) else ''}"
                 worst = larger(worst, share_of(ours - runs[0], ours - runs[1], runs[0], runs[1], where))
         return worst
@@ -278,7 +304,8 @@ def trial(
     most: float,
     seed: int,
 ) -> list[tuple[int, Share]]:
-    """The error of direct light by resolution of the light, from coarse to fine, until it is at most `most`.
+    """The error of direct light by resolution of the light, from coarse to fine, until it is at most `most`, or there
+    is no hope of that: it is HOPELESS times that, and two resolutions more have not taken a GAIN of it away.
 
     geometry: the mesh that the receivers `points` are on; only receivers that the strips need are traced."""
     tracer = Tracer(geometry.positions, geometry.faces)
@@ -292,6 +319,7 @@ def trial(
     for resolution in resolutions:
         lighting = Trial(judge.scene, geometry, points.at(rows), buried[rows], tracer, resolution, refine, seed)
         out.append((resolution, judge.error(lighting, strips, skies, 0, 0, edits=False)))
-        if out[-1][1].share <= most:
+        share = out[-1][1].share
+        if share <= most or (len(out) > 2 and share > max(HOPELESS * most, (1.0 - GAIN) * out[-3][1].share)):
             break
     return out

@@ -5,24 +5,23 @@ from __future__ import annotations
 import time
 from typing import Any
 
-import numpy as np
-
 import relight_formats as formats
 from relightcli import __version__
 from relightcli.adapters.files import need_output
 from relightcli.run import blocks as run
+from relightcli.run.accounting import Account
 from relightcli.scene.build import scene_to_json
 from relightcli.scene.model import Geometry
+from relightcli.stages.budget import summary
 from relightcli.stages.dry_run import dry_run
 from relightcli.stages.fields import describe, put_fields
 from relightcli.stages.inputs import need_unchanged, scene_inputs
+from relightcli.stages.lay_out import make_job, put_scene
 from relightcli.stages.pose_job import simulate_poses
 from relightcli.stages.precompute_config import Config
 from relightcli.stages.prepare import Prepared, prepare
 from relightcli.stages.promise import keep_promise
-from relightcli.stages.receiver_setup import PixelReceivers, put_geometry, put_receivers, put_vertex_colours
-from relightcli.stages.rig_store import put_rigs
-from relightcli.stages.visibility_job import VisibilityJob, block_size, create_outputs
+from relightcli.stages.visibility_job import block_size, create_outputs
 
 KIND = "transfer"
 WRONG_BITS = 1e-3  # share of wrong bits above which the user is told
@@ -30,12 +29,12 @@ WRONG_BITS = 1e-3  # share of wrong bits above which the user is told
 
 def precompute(config: Config) -> dict[str, Any]:
     """Runs the stage; returns a summary for the user. Raises the errors of `relightcli.errors` and OSError."""
-    started = time.perf_counter()
+    started, account = time.perf_counter(), Account()
     need_output(config.output)
     run.need_scheduler(None if config.dry_run else config.scheduler)
-    prepared = prepare(config)
+    prepared = prepare(config, account)
     if config.dry_run:
-        return dry_run(prepared)
+        return dry_run(prepared, account)
     inputs = scene_inputs(scene := prepared.scene)
     need_unchanged(prepared.read)
     source, geometry, moving = prepared.source, prepared.geometry, prepared.moving
@@ -51,8 +50,8 @@ def precompute(config: Config) -> dict[str, Any]:
         return {"store": str(config.output), "status": "up to date", "notes": list(geometry.notes)}
     with writer:
         resumed = bool(writer.done)
-        receivers, buried, starts = prepared.receivers()
-        points = receivers.points if isinstance(receivers, PixelReceivers) else receivers
+        with account.step("receivers"):
+            receivers, buried, starts = prepared.receivers()
         if moving is not None:
             writer.set_attrs({"fields": describe(moving, scene, starts)})
         writer.set_attrs(
@@ -63,68 +62,54 @@ def precompute(config: Config) -> dict[str, Any]:
                 "nothing_blocks": config.effects == "auto" and not prepared.shadows,
             }
         )
-        put_geometry(writer, geometry)
-        put_rigs(writer, geometry)
-        if geometry is not source:
-            writer.put("source/face", source.faces, dims=("face", "corner"))
-        put_receivers(writer, receivers, buried)
-        if prepared.bounce_cells and geometry.textures:
-            put_vertex_colours(writer, geometry)
-        job = VisibilityJob(
-            str(writer.partial_path),
-            prepared.resolution,
-            config.refine,
-            prepared.shadows,
-            config.basis,
-            config.coefficients,
-            config.tolerance or 0.0,
-            config.sh_order,
-            config.seed,
-            tuple(scene.lights.values()),
-            prepared.bounce_cells,
-            int(np.count_nonzero(points.vertex < 0)),
-            () if moving is None else tuple(geometry.object_names.index(m.mesh.name) for m in moving.movers),
-            starts,
-            prepared.posed,
-        )
-        create_outputs(writer, job, len(receivers))
-        run.run_blocks(
-            job,
-            run.split("visibility", len(receivers), block_size(prepared.resolution)),
-            writer,
-            workers=config.workers,
-            label="visibility",
-            quiet=config.quiet,
-            scheduler=config.scheduler,
-        )
-        run.close_worker()
-        if moving is not None:
-            put_fields(writer, moving, scene, config.fields, config.workers, config.quiet, config.scheduler)
-        if "pose" in prepared.simulated:
-            simulate_poses(
+        with account.step("scene"):
+            put_scene(writer, prepared, receivers, buried)
+        job = make_job(prepared, str(writer.partial_path), receivers, starts)
+        with account.step("visibility"):
+            size = block_size(prepared.resolution)
+            create_outputs(writer, job, len(receivers), size)
+            run.run_blocks(
+                job,
+                run.split("visibility", len(receivers), size),
                 writer,
-                scene,
-                geometry,
-                config.pose_frames,
-                config.pose_order,
-                config.pose_directions,
-                config.pose_surroundings,
-                config.workers,
-                config.quiet,
-                config.scheduler,
+                workers=config.workers,
+                label="visibility",
+                quiet=config.quiet,
+                scheduler=config.scheduler,
             )
+            run.close_worker()
+        if moving is not None:
+            with account.step("fields"):
+                put_fields(writer, moving, scene, config.fields, config.workers, config.quiet, config.scheduler)
+        if "pose" in prepared.simulated:
+            with account.step("pose"):
+                simulate_poses(
+                    writer,
+                    scene,
+                    geometry,
+                    config.pose_frames,
+                    config.pose_order,
+                    config.pose_directions,
+                    config.pose_surroundings,
+                    config.workers,
+                    config.quiet,
+                    config.scheduler,
+                )
         if prepared.promise is not None:
-            keep_promise(
-                config, prepared.promise, prepared.resolution, scene, source, geometry, receivers, buried, writer
-            )
-        writer.commit(
-            {
-                "seconds": time.perf_counter() - started,
-                "planning_seconds": prepared.planning_seconds,
-                "resumed": resumed,
-                "workers": config.workers,
-            }
-        )
+            with account.step("check"):
+                keep_promise(
+                    config,
+                    prepared.promise,
+                    prepared.resolution,
+                    prepared.finer_helps,
+                    scene,
+                    source,
+                    geometry,
+                    receivers,
+                    buried,
+                    writer,
+                )
+        writer.commit(summary(account, started, resumed, config.workers))
     return _summary(config, started, resumed, geometry)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,13 +16,14 @@ from relightcli.core.transport.shading import shading_scene
 from relightcli.core.transport.tessellation import tessellate
 from relightcli.errors import InputError
 from relightcli.plan import effects, pilot
+from relightcli.run.accounting import Account
 from relightcli.scene.build import build_geometry
 from relightcli.scene.model import Geometry, Scene
 from relightcli.scene.parse import load_scene
 from relightcli.stages.fields import Moving, add_points, find_movers, place, without
 from relightcli.stages.inputs import named_files, stamps
 from relightcli.stages.precompute_config import RESOLUTION, Config, check_bounces, check_config
-from relightcli.stages.promise import try_resolutions
+from relightcli.stages.promise import choose, try_resolutions
 from relightcli.stages.receiver_setup import (
     PixelReceivers,
     check_receivers,
@@ -57,7 +57,6 @@ class Prepared:
     promise: float | None  # the error to keep
     resolution: int = RESOLUTION
     tried: tuple[tuple[int, pilot.Share], ...] = ()  # resolutions, each with its error
-    planning_seconds: float = 0.0
     read: dict[Path, tuple[int, int, int]] = field(default_factory=dict)  # `stamps` of the scene's files before that
 
     @property
@@ -68,6 +67,11 @@ class Prepared:
     @property
     def shadows(self) -> bool:
         return "shadows" in self.simulated
+
+    @property
+    def finer_helps(self) -> bool:
+        """Whether a finer resolution of light could bring the error down, as far as was tried."""
+        return not self.tried or self.resolution == self.tried[-1][0]
 
     @property
     def posed(self) -> tuple[int, ...]:
@@ -88,7 +92,7 @@ class Prepared:
         Pixels look at the `source`: they are the same, and lit the same, with and without interreflections.
         """
         config, scene, geometry, both = self.config, self.scene, self.geometry, self.both
-        move_aside = self.shadows and not config.dry_run
+        move_aside = self.shadows
         if self.moving is not None:
             still = without(self.moving, geometry)
             vertices, buried = on_vertices(still, both), np.zeros(0, bool)
@@ -110,36 +114,36 @@ class Prepared:
         return vertices, buried, (0,)
 
 
-def prepare(config: Config) -> Prepared:
+def prepare(config: Config, account: Account) -> Prepared:
     """Reads the scene and decides. Raises InputError where settings do not go with the scene."""
     check_config(config)
     asked = effects.parse_effects(config.effects)
     wanted = effects.bounces_asked(asked, config.bounces)
     promise = config.tolerance if config.basis == "visibility" else None
     read = stamps([config.scene.absolute()])
-    scene = load_scene(config.scene, allow_outside=config.allow_outside)
-    read |= stamps(named_files(scene) - read.keys())
+    with account.step("reading"):
+        scene = load_scene(config.scene, allow_outside=config.allow_outside)
+        read |= stamps(named_files(scene) - read.keys())
+        source = build_geometry(scene)
     motions: dict[str, str] = {o.name: o.motion for o in scene.objects.values()}
-    source = build_geometry(scene)
     both = _both_sides(scene, source)
     check_receivers(config.receivers, scene, source)
     if wanted:
         check_bounces(config)
-    clock = time.perf_counter()
     fields = effects.decide_fields(asked, motions, len(scene.lights))
     pose = effects.decide_pose(asked, {name: len(rig.clips) for name, rig in source.rigs.items()})
-    plan, bounces = effects.decide(
-        asked,
-        source.positions,
-        source.faces,
-        bool(both.any()),
-        _lobes(scene),
-        wanted,
-        scene.tolerance if promise is None else promise,
-        lambda: _Pilot(scene, source),
-        fields.simulate or (asked is None and pose.simulate),
-    )
-    planning = time.perf_counter() - clock
+    with account.step("planning"):
+        plan, bounces = effects.decide(
+            asked,
+            source.positions,
+            source.faces,
+            bool(both.any()),
+            _lobes(scene),
+            wanted,
+            scene.tolerance if promise is None else promise,
+            lambda: _Pilot(scene, source),
+            fields.simulate or (asked is None and pose.simulate),
+        )
     if bounces:
         check_bounces(config)
     plan += [pose, fields]
@@ -155,11 +159,12 @@ def prepare(config: Config) -> Prepared:
         coarse = (config.light_resolution or RESOLUTION) % 16
         planned = 8 if coarse else effects.bounce_cells(plan, promise or scene.tolerance)
         bounce_cells = config.bounce_resolution or planned
-    moving = _moving(config, scene) if fields.simulate else None
-    uncut = source
-    if shadows and config.subdivide and (config.receivers == "vertices" or bounce_cells):
-        uncut = _subdivided(source, moving)
-    geometry = uncut if moving is None else place(moving, uncut)
+    with account.step("reading"):
+        moving = _moving(config, scene) if fields.simulate else None
+        uncut = source
+        if shadows and config.subdivide and (config.receivers == "vertices" or bounce_cells):
+            uncut = _subdivided(source, moving)
+        geometry = uncut if moving is None else place(moving, uncut)
     prepared = Prepared(
         config,
         scene,
@@ -173,13 +178,13 @@ def prepare(config: Config) -> Prepared:
         moving,
         promise,
         config.light_resolution or RESOLUTION,
-        planning_seconds=planning,
         read=read,
     )
-    if config.light_resolution is None and promise is not None and shadows:
-        receivers, buried, _ = prepared.receivers()
-        tried = try_resolutions(config, scene, source, geometry, receivers, buried, promise)
-        return replace(prepared, resolution=tried[-1][0], tried=tuple(tried))
+    if config.light_resolution is None and promise is not None:
+        with account.step("resolution"):
+            receivers, buried, _ = prepared.receivers()
+            tried = try_resolutions(config, scene, source, geometry, receivers, buried, promise)
+        return replace(prepared, resolution=choose(tried, promise), tried=tuple(tried))
     return prepared
 
 
@@ -201,7 +206,7 @@ class _Pilot:
 def _row(decision: effects.Decision) -> dict[str, Any]:
     """A row of the plan as it is stored; what was not measured is left out."""
     row = {"effect": decision.effect, "simulate": decision.simulate, "evidence": decision.evidence}
-    measured = {"share": decision.share, "bound": decision.bound}
+    measured = {"share": decision.share, "bound": decision.bound, "rest": decision.rest}
     return row | {key: value for key, value in measured.items() if value is not None and math.isfinite(value)}
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, cast
+import math
+import time
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +17,16 @@ from relightcli.plan import pilot
 from relightcli.scene.model import Camera, Geometry, Scene
 from relightcli.stages.lighting import LightingStore
 from relightcli.stages.measured_error import (
+    GAIN,
     MORE,
+    STRIP,
     Draft,
     Judge,
     Strips,
     check_skies,
     check_views,
     pixel_strips,
+    rows_of,
     trial,
     vertex_strips,
 )
@@ -84,10 +89,32 @@ def try_resolutions(
     )
 
 
+def choose(tried: list[tuple[int, pilot.Share]], promise: float) -> int:
+    """The coarsest resolution whose direct light is near enough; where none is, the coarsest that is as good as any:
+    what is wrong then does not come from the resolution, and a finer one would only cost."""
+    least = min(share.share for _, share in tried)
+    most = max(DIRECT * promise, (1.0 + GAIN) * least)
+    return next(resolution for resolution, share in tried if share.share <= most)
+
+
+def predict_check(config: Config, scene: Scene, source: Geometry, bounces: int) -> float:
+    """Seconds that `keep_promise` will trace, from a few rows of one of its pictures."""
+    judge = Judge(scene, source, Tracer(source.positions, source.faces))
+    cameras, skies = check_views(scene, source, _camera_of(config)), check_skies()
+    middle = cameras[0].size[1] // 2
+    rows = (max(0, middle - STRIP // 2), middle + max(1, STRIP // 2))
+    clock = time.perf_counter()
+    judge.trace(Strips(cameras[0], [rows], []), next(iter(skies.values())), scene.materials, bounces + MORE, 0)
+    taken = time.perf_counter() - clock
+    pixels = sum(sum(b - a for a, b in rows_of(c)) * c.size[0] for c in cameras)
+    return 2 * len(skies) * taken * pixels / ((rows[1] - rows[0]) * cameras[0].size[0])
+
+
 def keep_promise(
     config: Config,
     promise: float,
     resolution: int,
+    finer_helps: bool,
     scene: Scene,
     source: Geometry,
     geometry: Geometry,
@@ -95,14 +122,19 @@ def keep_promise(
     buried: NDArray[np.bool_] | None,
     writer: formats.Writer,
 ) -> None:
-    """Measures the error of what was made and keeps it with it; raises NumericalError where it is too large."""
+    """Measures the error of what was made and keeps it with it; raises NumericalError where it is too large.
+
+    finer_helps: it is not known that a finer resolution of light would change nothing.
+    """
     lighting = LightingStore(cast("formats.Store", Draft(writer)), config.workers)
     judge = Judge(scene, source, Tracer(source.positions, source.faces))
     strips = _strips(scene, geometry, receivers, buried, check_views(scene, source, _camera_of(config)))
     skies = check_skies()
     bounces = lighting.bounces
     found = judge.error(lighting, strips, skies, bounces, bounces + MORE, edits=True)
-    measured = {"share": found.share, "bound": found.bound, "where": found.where}
+    measured: dict[str, Any] = {"share": found.share, "where": found.where}
+    if math.isfinite(found.bound):  # else the two runs do not tell
+        measured["bound"] = found.bound
     writer.set_attrs({"measured_error": {**measured, "tolerance": promise}})
     if found.share <= promise or config.allow_miss:
         return
@@ -111,10 +143,11 @@ def keep_promise(
         knob = f"--bounces {bounces + 1} or a finer --bounce-resolution"
     elif config.receivers == "vertices":
         knob = f"--receivers pixels:{next(iter(scene.cameras), 'CAMERA')}, or a finer mesh"
-    elif resolution < RESOLUTIONS[-1]:
+    elif resolution < RESOLUTIONS[-1] and finer_helps:
         knob = f"--light-resolution {2 * resolution}"
     else:
-        knob = f"--pixel-grid {min(config.pixel_grid + 1, MOST_PIXEL_GRID)} or --light-resolution {2 * resolution}"
+        grid = min(config.pixel_grid + 1, MOST_PIXEL_GRID)
+        knob = f"--pixel-grid {grid}" + (f" or --light-resolution {2 * resolution}" if finer_helps else "")
     raise NumericalError(
         f"{config.output}: the error is {found.share:.2%} ({found.where}; of direct light {direct.share:.2%}), more "
         f"than the tolerance of {promise:.2%}. What would help: {knob}. The work is kept in "

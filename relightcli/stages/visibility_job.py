@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from bisect import bisect_right
 from dataclasses import dataclass
 from itertools import pairwise
@@ -20,6 +19,7 @@ from relightcli.core.transport.light_visibility import POINTS_PER_LIGHT, light_b
 from relightcli.core.transport.local_lights import pack_lights
 from relightcli.core.transport.receivers import receivers_of_vertices
 from relightcli.run import blocks as run
+from relightcli.run.accounting import Meter
 from relightcli.scene.model import RectangleLight, SphereLight
 from relightcli.stages.receiver_setup import hidden
 
@@ -69,9 +69,8 @@ class VisibilityWorker:
     def run(self, block: run.Block) -> run.Info:
         job, rows = self.job, slice(block.start, block.stop)
         position, normal = self.position[rows], self.normal[rows]
-        info: run.Info = {"rays": 0.0, "checked": 0.0, "wrong": 0.0, "inferred": 0.0, "bits": 0.0, "trace_seconds": 0.0}
-        if job.bounce_cells:
-            info |= {"bounce_rays": 0.0, "bounce_seconds": 0.0}
+        info: run.Info = {"rays": 0.0, "checked": 0.0, "wrong": 0.0, "inferred": 0.0, "bits": 0.0}
+        info |= {f"{part}_{key}": 0.0 for part in _costs(job) for key in ("rays", "seconds", "cpu_seconds")}
         pieces = []
         for entity, first, end in self._parts(block.start, block.stop):
             part = slice(first - block.start, end - block.start)
@@ -137,30 +136,43 @@ class VisibilityWorker:
     ) -> dict[str, NDArray[Any]]:
         """What receivers of the part from `first` on see of sky, lights and surfaces, by array."""
         job = self.job
-        start = time.perf_counter()
+        meter, rays = Meter(), 0
         if tracer is None:
             bits = visibility.horizon_bits(normal, job.resolution)
         else:
             traced = visibility.trace_visibility(tracer, position, normal, job.resolution, job.refine, job.seed + first)
             bits = traced.bits
-            info["rays"] += float(traced.rays)
+            rays = traced.rays
             info["checked"] += float(traced.checked)
             info["wrong"] += float(traced.wrong)
             info["inferred"] += float(traced.inferred)
             info["bits"] += float(3 * job.resolution**2 * len(bits))
+        _add(info, "trace", meter, rays)
         out: dict[str, NDArray[Any]] = {"visibility/bits": bits}
         if self.lights.number:
+            meter = Meter()
             out["lights/bits"], rays = light_bits(tracer, self.lights, position, normal)
-            info["rays"] += float(rays)
-        info["trace_seconds"] += time.perf_counter() - start
+            _add(info, "light", meter, rays)
         if surfaces is not None and tracer is not None:
-            start = time.perf_counter()
+            meter = Meter()
             hits = trace_hits(tracer, surfaces, position, normal, bits, job.bounce_cells, first, job.seed)
             out["bounce/hit"], rays = hits
-            info["bounce_rays"] += float(rays)
-            info["bounce_seconds"] += time.perf_counter() - start
-            info["rays"] += float(rays)
+            _add(info, "bounce", meter, rays)
         return out
+
+
+def _costs(job: VisibilityJob) -> list[str]:
+    """What a block's costs are kept apart by: visibility, local lights, interreflections."""
+    return ["trace", *(["light"] if job.lights else []), *(["bounce"] if job.bounce_cells else [])]
+
+
+def _add(info: dict[str, float], part: str, meter: Meter, rays: int) -> None:
+    """Adds to a block's costs those of one part; `rays` are of all parts."""
+    found = meter.read()
+    info["rays"] += float(rays)
+    info[f"{part}_rays"] += float(rays)
+    info[f"{part}_seconds"] += found["seconds"]
+    info[f"{part}_cpu_seconds"] += found["cpu_seconds"]
 
 
 @dataclass(frozen=True)
@@ -224,9 +236,10 @@ def block_size(resolution: int) -> int:
     return min(size, 4096)
 
 
-def create_outputs(writer: formats.Writer, job: VisibilityJob, count: int) -> None:
-    """The arrays that the job's blocks fill, `count` receivers long, a chunk per block (of `direct/dense` several)."""
-    resolution, size = job.resolution, block_size(job.resolution)
+def create_outputs(writer: formats.Writer, job: VisibilityJob, count: int, size: int) -> None:
+    """The arrays that the job's blocks fill, `count` receivers long, a chunk per block of `size` (of `direct/dense`
+    several)."""
+    resolution = job.resolution
     if job.lights:
         n = len(job.lights) * POINTS_PER_LIGHT // 8
         writer.array(
