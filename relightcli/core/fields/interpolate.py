@@ -117,7 +117,8 @@ def locate_one(x, y, z, radii, logarithmic, padded, stand_in, index, weight):  #
     if distance >= radii[last]:
         low, fade = last, (radii[last] / distance) ** 2
     elif distance > radii[0]:
-        low = int(np.searchsorted(radii, distance, side="right")) - 1
+        while radii[low + 1] <= distance:
+            low += 1
         if logarithmic:
             along = math.log(distance / radii[low]) / math.log(radii[low + 1] / radii[low])
         else:
