@@ -8,7 +8,7 @@ it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -57,13 +57,13 @@ SLAB = 8192  # receivers whose sky terms are made at a time
 @dataclass
 class _Passed:
     """Light on its way in one picture: at the proxies after the last reflection, (P, 3, N); and, of all reflections so
-    far together, that which was reflected again, at the proxies, at the sites from behind (S, 3, N), and at close
-    points (k, 3, N) of each mover."""
+    far together, that which was reflected again, at the proxies, at the sites from behind (S, 3, N), and what the
+    samples send that are read early, and the close points', in rows as `chain.open_rows` has them."""
 
     at_proxies: F32
     reflected: F32
     behind: F32
-    near: list[F32] = field(default_factory=list)
+    rows: F32
 
 
 class MovingStore(LightingStore):
@@ -228,8 +228,7 @@ class MovingStore(LightingStore):
         behind = light_from_sky(placed.views, cells, self.threads)
         count = placed.proxies.stop - placed.proxies.start
         nothing = np.zeros((count, 3, self.order**2), np.float32)
-        self._passed = _Passed(nothing, nothing.copy(), np.zeros_like(behind))
-        self._passed.near = [np.zeros((len(c.target), *nothing.shape[1:]), np.float32) for c in placed.close]
+        self._passed = _Passed(nothing, nothing.copy(), np.zeros_like(behind), placed.rows.copy())
         self._pass_on(placed, placed.rows, behind, view, found)
         return found
 
@@ -271,11 +270,9 @@ class MovingStore(LightingStore):
         """Exit radiance of the movers' points, of all reflections, into out."""
         placed, passed = self._where(), self._passed
         assert passed is not None
-        rows = placed.rows.copy()
-        put_reflections(rows, placed.entities, placed.lookup, self._lights(passed.reflected), threads=self.threads)
-        for near, where in zip(passed.near, placed.where, strict=True):
-            rows[where, 1:] = near
-        self._light_points(placed, rows, passed.behind, None, view, out)
+        lights, late = self._lights(passed.reflected), ~placed.early
+        put_reflections(passed.rows, placed.entities, placed.lookup, lights, threads=self.threads, wanted=late)
+        self._light_points(placed, passed.rows, passed.behind, None, view, out)
 
     def _light_points(
         self,
@@ -425,8 +422,7 @@ class MovingStore(LightingStore):
         """See `LightingStore._reflected`: the movers' light is added, and theirs is made."""
         placed, n, passed = self._where(), self.static, self._passed
         assert passed is not None
-        rows = placed.rows.copy()
-        rows[:, 1:] = 0.0
+        rows = placed.work
         wanted = None if self.apart else placed.early
         lights = self._lights(passed.at_proxies)
         passed.reflected += passed.at_proxies
@@ -436,7 +432,8 @@ class MovingStore(LightingStore):
                 continue
             mover, turn = self.movers[k], placed.entities[k].turn(self.order)
             rows[where, 1:] = sent(close, mover.body, light.diffuse[mover.rows], turn)
-            passed.near[k] += rows[where, 1:]
+        if not self.apart:
+            passed.rows[:, 1:] += rows[:, 1:]
         none = np.zeros((3, self.order**2), np.float32)
         arriving = self._at(placed, placed.still, rows, none)
         e[:n] += self._irradiance_of(arriving)

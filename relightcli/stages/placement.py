@@ -28,7 +28,7 @@ class Placement:
     order of the receivers: slices `still`, `proxies`, `points`.
     entities: the movers, then the local lights; rows: their samples' (`chain.open_rows`), emitted light included
     close: per mover its close points, where: their rows; early (T,): samples that light is needed of after every
-    reflection, not only of all together
+    reflection, not only of all together; work: rows to put reflections into, what passes is in them
     shown, shown_at: the movers' points, as rows of the receivers and of the points, that close points see
     passed (n, N): what all movers let pass to the standing receivers; covered (receivers,): what nothing can see
     views: what stands, from all movers' sites; share (targets, E): of an entity, what standing things do not hide, None
@@ -41,6 +41,7 @@ class Placement:
     close: list[Close]
     where: list[slice]
     early: NDArray[np.bool_]
+    work: F32
     shown: NDArray[np.int64]
     passed: F32
     covered: NDArray[np.bool_]
@@ -158,9 +159,9 @@ def place(
         share[last] = sites.spread.blend(free)
     dark = rows.copy()
     dark[:, 1:] = 0.0
-    passed = passing(lookup.points(still), dark, threads)
+    passed = passing(lookup.points(still), dark, threads, 1.0 / order**2)
     return Placement(
-        entities, lookup, rows, close, where, early, some, passed, hidden, views, share, still, middle, last
+        entities, lookup, rows, close, where, early, dark, some, passed, hidden, views, share, still, middle, last
     )
 
 

@@ -169,13 +169,15 @@ def light_at(
     return out
 
 
-def passing(lookup: Lookup, rows: NDArray[np.float32], threads: int = 1) -> NDArray[np.float32]:
-    """What all entities together let pass of even light of radiance 1, (n, N) float32."""
-    dark = rows.copy()
-    dark[:, 1:] = 0.0
+def passing(lookup: Lookup, rows: NDArray[np.float32], threads: int = 1, merged: float = 0.0) -> NDArray[np.float32]:
+    """What all entities together let pass of even light of radiance 1, (n, N) float32; merged: see `light_at`."""
+    dark = rows
+    if rows[:, 1:].any():
+        dark = rows.copy()
+        dark[:, 1:] = 0.0
     even = np.zeros((3, rows.shape[2]))
     even[0, 0] = EVEN
-    return light_at(lookup, dark, even, threads)[:, 0]
+    return light_at(lookup, dark, even, threads, merged=merged)[:, 0]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})

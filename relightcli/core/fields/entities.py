@@ -8,6 +8,7 @@ both hold the entity, and for boxes, walls and balls one of them is the surface.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
@@ -16,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.fields.field import Field, SourceField
-from relightcli.core.fields.interpolate import CORNERS, Grid, locate_one, make_grid
+from relightcli.core.fields.interpolate import CORNERS, Grid, locate_one, make_grid, shell_steps
 from relightcli.core.shade.gather import in_parts
 from relightcli.core.sphere.rotation import rotation_matrices
 
@@ -221,37 +222,36 @@ def look_up(entities: list[Entity], points: NDArray[np.floating], skip: NDArray[
     return Lookup(found - np.repeat(first[:-1], np.diff(start)), start, place, weight, nearest, inside)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _visit(  # type: ignore[no-untyped-def]
     points, skip, e, start, rotation, translation, scale, center, box, radius, radii, logarithmic, padded, stand_in,
     index, weight, distance, inside, read,
 ):  # fmt: skip
-    q = np.empty(3)
-    inverse = 1.0 / scale
+    squares, steps = shell_steps(radii, logarithmic)
+    # Into the entity's frame, about its centre: turned by the inverse, which is the transpose.
+    turn, t = rotation / scale, (translation[0], translation[1], translation[2])
+    low = (box[0, 0] - center[0], box[0, 1] - center[1], box[0, 2] - center[2])
+    high = (box[1, 0] - center[0], box[1, 1] - center[1], box[1, 2] - center[2])
     for i in range(len(points)):
         if skip[i] == e:
             distance[i, e] = np.inf
             continue
-        for x in range(3):
-            total = 0.0
-            for y in range(3):
-                total += rotation[y, x] * (points[i, y] - translation[y])
-            q[x] = total * inverse
-        outside, least, square = 0.0, -np.inf, 0.0
-        for x in range(3):
-            beyond = max(box[0, x] - q[x], q[x] - box[1, x])
-            least = max(least, beyond)
-            outside += max(beyond, 0.0) ** 2
-            q[x] -= center[x]
-            square += q[x] * q[x]
-        inside[i, e] = square < radii[0] * radii[0]
-        to_box = np.sqrt(outside) if outside > 0.0 else least
-        distance[i, e] = scale * max(to_box, np.sqrt(square) - radius)
-        locate_one(q[0], q[1], q[2], radii, logarithmic, padded, stand_in, index[i, e], weight[i, e])
-        for k in range(index.shape[2]):
-            index[i, e, k] += start
-            if weight[i, e, k] > 0.0:
-                read[index[i, e, k]] = True
+        a, b, c = points[i, 0] - t[0], points[i, 1] - t[1], points[i, 2] - t[2]
+        x = turn[0, 0] * a + turn[1, 0] * b + turn[2, 0] * c - center[0]
+        y = turn[0, 1] * a + turn[1, 1] * b + turn[2, 1] * c - center[1]
+        z = turn[0, 2] * a + turn[1, 2] * b + turn[2, 2] * c - center[2]
+        square = x * x + y * y + z * z
+        bx, by, bz = max(low[0] - x, x - high[0]), max(low[1] - y, y - high[1]), max(low[2] - z, z - high[2])
+        outside = max(bx, 0.0) ** 2 + max(by, 0.0) ** 2 + max(bz, 0.0) ** 2
+        to_box = math.sqrt(outside) if outside > 0.0 else max(bx, by, bz)
+        distance[i, e] = scale * max(to_box, math.sqrt(square) - radius)
+        inside[i, e] = square < squares[0]
+        own, w = index[i, e], weight[i, e]
+        locate_one(x, y, z, radii, squares, steps, logarithmic, padded, stand_in, own, w)
+        for k in range(CORNERS):
+            own[k] += start
+            if w[k] > 0.0:
+                read[own[k]] = True
 
 
 @njit(cache=True, nogil=True)
