@@ -48,7 +48,7 @@ def measure(setting: Setting) -> Report:
             continue
         path = write(made, setting.work / make.__name__, size)
         sky = _sky(path.parent, made.even)
-        store, seconds = _store(path, "store", **BASE)
+        store, seconds = _store(path, "store", made.coarse, **BASE)
         worst = dict.fromkeys(LAYERS, 0.0)
         most = 0.0
         for moves in made.places[:1] if setting.quick else made.places:
@@ -85,7 +85,7 @@ def _curve(setting: Setting, size: tuple[int, int], spp: int, cells: int, detail
     refs: list[Picture] = []
     for key, values in CURVE[:1] if setting.quick else CURVE:
         for value in values[:2] if setting.quick else values:
-            store, seconds = _store(path, f"{key}-{value}", **{**BASE, key: value})
+            store, seconds = _store(path, f"{key}-{value}", False, **{**BASE, key: value})
             refs = refs or _references(store, sky, made.places[0], 4 * spp)
             ours, milliseconds = _picture(store, sky, made.places[0])
             errors = [error(ours[name], *(r[name] for r in refs)) for name in LAYERS]
@@ -103,7 +103,7 @@ def _suns(setting: Setting, size: tuple[int, int], spp: int, cells: int, detail:
     path = write(made, setting.work / "suns", size)
     sky = path.parent / "sun.exr"
     write_image(sky, sky_latlong(40.0, 150.0))
-    store, _ = _store(path, "store", **BASE)
+    store, _ = _store(path, "store", False, **BASE)
     rows: list[tuple[str | int | float, ...]] = []
     for moves in made.places[1:2] if setting.quick else made.places[1::2]:
         refs = _references(store, sky, moves, spp)
@@ -124,7 +124,7 @@ def _sky(folder: Path, even: bool) -> Path:
     return folder / "sky.exr"
 
 
-def _store(path: Path, name: str, **fields: Any) -> tuple[Path, float]:
+def _store(path: Path, name: str, subdivide: bool, **fields: Any) -> tuple[Path, float]:
     """Precomputes; the store and the seconds that it took."""
     from relightcli.stages.precompute import precompute
     from relightcli.stages.precompute_config import Config
@@ -137,7 +137,7 @@ def _store(path: Path, name: str, **fields: Any) -> tuple[Path, float]:
             output=store,
             quiet=True,
             workers=cores(),
-            subdivide=False,
+            subdivide=subdivide,
             light_resolution=32,
             bounces=BOUNCES,
             **fields,

@@ -24,12 +24,13 @@ PANEL = (
 @dataclass
 class MovingScene:
     """scene; at: where the scene file has every mover; places: what `--move` takes for each picture; even: under an
-    even sky, else one that is brighter above and on one side."""
+    even sky, else one that is brighter above and on one side; coarse: meshes that want more vertices."""
 
     scene: BounceScene
     at: dict[str, tuple[float, float, float]]
     places: list[tuple[str, ...]]
     even: bool = False
+    coarse: bool = False
 
 
 def write(made: MovingScene, folder: Path, size: tuple[int, int]) -> Path:
@@ -135,7 +136,7 @@ def chess(cells: int, detail: int) -> MovingScene | None:
         ("king=-0.5,0,0.5", "knight=0.5,0,-0.5,0,90,0", "pawn=0.5,0,0.5"),
         ("king=1.5,0,0.5", "knight=-0.5,0.4,1.5,0,30,0", "pawn=-0.5,0,-0.5"),
     ]
-    return MovingScene(scene, at, places)
+    return MovingScene(scene, at, places, coarse=True)
 
 
 MAKERS: tuple[Callable[[int, int], MovingScene | None], ...] = (ball, lamp, room, bricks, chess)
