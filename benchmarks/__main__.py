@@ -35,6 +35,7 @@ NAMES = (
     "pose",
     "fields",
     "promise",
+    "moving",
 )
 PACKAGES = ("relightcli", "numpy", "numba", "zarr", "embreex", "mitsuba", "pyradiance")
 RESULTS = Path("build/bench.json")

@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 
 import relight_formats as formats
 from relightcli.adapters.rays import Tracer
-from relightcli.core.fields.body import Body, make_body
+from relightcli.core.fields.body import Body
 from relightcli.core.fields.build import field_samples
 from relightcli.core.fields.field import Field, SelfTransfer, SourceField
 from relightcli.core.fields.self_transfer import exits_of, solve
 from relightcli.run import blocks as run
 from relightcli.scene.model import Material
+from relightcli.stages.bodies import body_of
 
 CHUNK_BYTES = 4_000_000
 
@@ -127,7 +128,7 @@ def open_body(partial: str, spec: FieldSpec) -> tuple[Body, Tracer]:
     def read(name: str) -> Any:
         return formats.worker_array(partial, f"{spec.prefix}mesh/{name}")[...]
 
-    body = make_body(
+    body = body_of(
         read("position"), read("normal"), read("face"), spec.two_sided, read("texture"), spec.material, spec.order
     )
     return body, Tracer(body.positions, body.faces)

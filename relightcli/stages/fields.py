@@ -19,7 +19,7 @@ from relightcli import __version__
 from relightcli.adapters.gltf import buffer_files
 from relightcli.adapters.rays import Tracer
 from relightcli.core.fields.adaptive import adaptive_radii, least_resolution
-from relightcli.core.fields.body import Body, make_body
+from relightcli.core.fields.body import Body
 from relightcli.core.fields.build import RAYS, field_samples
 from relightcli.core.fields.field import shell_radii
 from relightcli.core.fields.proxies import place_proxies
@@ -30,6 +30,7 @@ from relightcli.errors import InputError
 from relightcli.scene.bodies import OwnMesh, own_mesh, put_meshes, vertex_numbers
 from relightcli.scene.materials import table_from_material
 from relightcli.scene.model import Geometry, Scene
+from relightcli.stages.bodies import body_of
 from relightcli.stages.field_store import FieldSpec, copy_field, put_body, put_source, simulate
 
 KIND = "field"
@@ -129,7 +130,7 @@ def find_movers(scene: Scene, settings: FieldSettings, cut: bool, seed: int) -> 
         mesh = own_mesh(scene, name, cut)
         texture = vertex_colours(mesh.geometry)
         own = mesh.geometry
-        body = make_body(own.positions, own.normals, own.faces, spec.two_sided, texture, material, settings.order)
+        body = body_of(own.positions, own.normals, own.faces, spec.two_sided, texture, material, settings.order)
         files = [spec.mesh, *buffer_files(spec.mesh)]
         if material.diffuse_texture is not None:
             files.append(material.diffuse_texture)

@@ -120,7 +120,12 @@ def described(path: object) -> Iterator[None]:
 
 
 class LightingStore:
-    """An open transfer store. Reads what it needs when it needs it; keeps small visibility in memory."""
+    """An open transfer store. Reads what it needs when it needs it; keeps small visibility in memory.
+
+    apart: whether the entries of `exit_radiance` are wanted one by one, or no more than their sum.
+    """
+
+    apart = True
 
     def __init__(self, store: Path | formats.Store, threads: int) -> None:
         self.store = formats.open_store(store) if isinstance(store, Path) else store
@@ -152,6 +157,7 @@ class LightingStore:
         self._gathered: dict[int, Gather] = {}
         self._seen: list[tuple[int, Gather]] | None = None
         self._coated: tuple[dict[str, Material], _Coats] | None = None
+        self._cubes: list[tuple[NDArray[np.float32], int, float, SkyCube]] = []
         self._bits: Future[NDArray[np.uint8]] | None = None
         if "visibility/bits" in self.store:
             layout = self.store.layouts["visibility/bits"]
@@ -203,6 +209,16 @@ class LightingStore:
                 'precompute objects with motion = "rigid" and their fields'
             )
         return []
+
+    def trace_suns(self) -> None:
+        """Shadows that movers throw in the light of suns become sharp. Raises InputError where nothing moves."""
+        raise InputError(
+            f"--suns traced: {self.store.path} holds nothing that may be moved: its shadows are as sharp as they get"
+        )
+
+    def costs(self) -> dict[str, Any]:
+        """What the pictures so far took, by step; empty where there are no steps."""
+        return {}
 
     def put_light(self, writer: formats.Writer) -> None:
         """Writes what a later `resume` needs, if anything."""
@@ -308,7 +324,7 @@ class LightingStore:
         basis: str,
     ) -> Radiance:
         """Light that is reflected once: diffuse of `active` receivers, specular of those `looked_at` (None: all)."""
-        sky = latlong_to_cube(environment, self.resolution, rotate)
+        sky = self._cube(environment, self.resolution, rotate)
         material, table, partner = coats.material, coats.table, coats.partner
         if partner is not None and active is not None:
             active = active | active[partner]  # light comes through from the other side
@@ -324,6 +340,15 @@ class LightingStore:
         if lamps is not None:
             specular += lamps * table.parameters[material][:, SPECULAR : SPECULAR + 3].astype(np.float32)
         return Radiance(diffuse, specular)
+
+    def _cube(self, environment: NDArray[np.float32], resolution: int, rotate: float) -> SkyCube:
+        """The map as a cube; those of the last two arrays are kept."""
+        for known, size, turn, sky in self._cubes:
+            if known is environment and (size, turn) == (resolution, rotate):
+                return sky
+        made = latlong_to_cube(environment, resolution, rotate)
+        self._cubes = [*self._cubes[-1:], (environment, resolution, rotate, made)]
+        return made
 
     def _exact_specular(
         self,

@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 import relight_formats as formats
 from relightcli.adapters.rays import Tracer
 from relightcli.core.brdf.models import SPECULAR, pack_materials
-from relightcli.core.fields.body import Body, make_body
+from relightcli.core.fields.body import Body
 from relightcli.core.fields.entities import Entity, PlainTransfer, Surroundings, of_light
 from relightcli.core.fields.interpolate import make_grid
 from relightcli.core.fields.shade import Receivers, make_receivers
 from relightcli.core.fields.standing import Between, between
 from relightcli.errors import InputError
 from relightcli.scene.model import Material, RectangleLight, SphereLight
+from relightcli.stages.bodies import body_of
 from relightcli.stages.field_store import read_source
 
 F32 = NDArray[np.float32]
@@ -114,9 +115,7 @@ def _read_object(store: formats.Store, key: tuple[int, str, bool], material: Mat
     prefix = f"fields/{key[0]}/"
     read: Any = store.read
     position, face = read(f"{prefix}mesh/position"), read(f"{prefix}mesh/face")
-    body = make_body(
-        position, read(f"{prefix}mesh/normal"), face, key[2], read(f"{prefix}mesh/texture"), material, order
-    )
+    body = body_of(position, read(f"{prefix}mesh/normal"), face, key[2], read(f"{prefix}mesh/texture"), material, order)
     radii, valid = read(f"{prefix}radii"), read(f"{prefix}valid")
     proxies = read(f"{prefix}proxies")
     used = position[np.unique(face)]

@@ -17,6 +17,7 @@ from relightcli.adapters.rays import Tracer
 from relightcli.core.lights.environment import SkyCube
 from relightcli.core.transport.local_lights import pack_lights
 from relightcli.stages.moving import MovingStore
+from relightcli.stages.placement import Sites
 from relightcli.stages.posed import PoseStore
 
 
@@ -44,11 +45,14 @@ class PosedMovingStore(MovingStore, PoseStore):
     def _pose_again(self) -> list[str]:
         notes = self._pose(self._asked[1], self.geometry, self.position, self.normal)
         # What hangs on where characters are, and is kept from move to move.
-        self._still = Tracer(self.geometry.positions, self._faces)
-        self._seen_from, self._bits_of_lights, self._sky, self._placed = {}, {}, None, None
+        self._standing = self.geometry.positions
+        self._still, self._sites = Tracer(self._standing, self._faces), Sites(self.movers)
+        self._bits_of_lights, self._terms, self._undimmed, self._placed = {}, None, None, None
+        if self._suns is not None:
+            self.trace_suns()
         return notes
 
-    def _sky_terms(self, sky: SkyCube) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    def _sky_terms(self, sky: SkyCube) -> NDArray[np.float32]:
         if self._scene is not None:
             self._scene.look_around()  # what movers hide from posed receivers is taken from bits
         return super()._sky_terms(sky)

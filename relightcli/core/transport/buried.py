@@ -71,7 +71,7 @@ def unbury(
         count = first[vertex + 1] - first[vertex]
         who = np.repeat(left, count)
         if len(who) == 0:
-            break
+            continue  # none of these is on a rim; halfway the others have their try
         within = np.arange(len(who)) - np.repeat(np.cumsum(count) - count, count)
         there = along(corner[np.repeat(first[vertex], count) + within], step)
         free = ~find_buried(tracer, there, receivers.normal[who], reach[who], face_normals, two_sided)
