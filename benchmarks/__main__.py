@@ -32,6 +32,7 @@ NAMES = (
     "clusters",
     "pose",
     "fields",
+    "field_stores",
 )
 PACKAGES = ("relightcli", "numpy", "numba", "zarr", "embreex", "mitsuba", "pyradiance")
 RESULTS = Path("build/bench.json")

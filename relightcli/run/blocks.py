@@ -72,8 +72,12 @@ def run_blocks(
     workers: int,
     label: str,
     quiet: bool = False,
+    apart: bool = False,
 ) -> None:
-    """Runs every block that the ledger does not hold yet. Raises what a block raised; what is done stays done."""
+    """Runs every block that the ledger does not hold yet. Raises what a block raised; what is done stays done.
+
+    apart: in worker processes always. There linear algebra has one thread, and the same bytes come out everywhere.
+    """
     todo = [b for b in blocks if b.id not in ledger.done]
     total = len(todo) + len(ledger.done)
     if not todo:
@@ -84,7 +88,7 @@ def run_blocks(
             ledger.record(block.id, info)
             progress.step(info)
 
-        if workers <= 1 or len(todo) == 1:
+        if not apart and (workers <= 1 or len(todo) == 1):
             for block in todo:
                 finish(block, _run(job, block))
             return
@@ -92,7 +96,7 @@ def run_blocks(
         while todo:
             before = len(todo)
             try:
-                with _pool(min(workers, len(todo))) as pool:
+                with _pool(max(1, min(workers, len(todo)))) as pool:
                     todo = _drain(pool, job, todo, finish)
             except BrokenProcessPool:
                 todo = [b for b in todo if b.id not in ledger.done]

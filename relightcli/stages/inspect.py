@@ -8,6 +8,7 @@ from typing import Any
 
 import relight_formats as formats
 from relightcli.errors import StoreError
+from relightcli.stages.field_store import describe_fields
 
 SUMMED = (
     "seconds",
@@ -62,6 +63,9 @@ def inspect(path: Path, verify: bool) -> dict[str, Any]:
         "cost": _cost(store.blocks),
         "summary": store.summary,
     }
+    fields = describe_fields(store)
+    if fields:
+        result["fields"] = fields
     models = [_model(block) for block in store.blocks if store.kind == "pose" and block["id"].startswith("fit/")]
     if models:
         result["models"] = models

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,47 +11,22 @@ from numpy.typing import NDArray
 import relight_formats as formats
 from relightcli.adapters.rays import Tracer
 from relightcli.core.brdf.models import SPECULAR, pack_materials
-from relightcli.core.fields.body import Body, make_body
-from relightcli.core.fields.entities import Entity, PlainTransfer, Surroundings, of_light
+from relightcli.core.fields.body import Body, axes, make_body
+from relightcli.core.fields.entities import Entity, Surroundings, of_light
 from relightcli.core.fields.interpolate import make_grid
-from relightcli.core.fields.shade import Receivers, make_receivers
+from relightcli.core.fields.shade import Receivers
 from relightcli.core.fields.standing import Between, between
+from relightcli.core.sphere.rotation import rotation_matrices
 from relightcli.errors import InputError
 from relightcli.scene.model import Material, RectangleLight, SphereLight
-from relightcli.stages.field_store import read_source
+from relightcli.stages.field_store import KeptField, read_field, read_source
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 SITES = 64  # points of an object that look around at what stands
 INWARDS = 0.01  # of the way to the centre that they lie within: what stands on a floor does not look from below it
+_SLAB = 2048  # points at a time
 SIMILAR = 1e-6  # relative, by which a placement may differ from a rotation and a size
-
-
-class StoredTransfer:
-    """The transfer of a field's samples, read from its store chunk by chunk as samples are asked for."""
-
-    def __init__(self, array: Any) -> None:
-        self.array, self.block, self.cells = array, array.chunks[1], array.shape[1]
-        self._read: dict[tuple[int, int], PlainTransfer] = {}
-
-    def reflect(self, light: NDArray[np.floating], which: NDArray[np.integer]) -> F32:
-        """See `entities.Transfer`. which: rising."""
-        out = np.empty((len(which), 3, light.shape[2]), np.float32)
-        shell, cell = np.divmod(which, self.cells)
-        number = shell * (1 + self.cells // self.block) + cell // self.block
-        for a, b in _runs(number):
-            at = int(shell[a]), int(cell[a]) // self.block
-            if at not in self._read:
-                first = at[1] * self.block
-                rows = np.asarray(self.array[at[0], first : first + self.block], np.float32)
-                self._read[at] = PlainTransfer(rows)
-            out[a:b] = self._read[at].reflect(light, cell[a:b] - at[1] * self.block)
-        return out
-
-
-def _runs(number: NDArray[np.integer]) -> list[tuple[int, int]]:
-    cuts = np.concatenate([[0], np.flatnonzero(np.diff(number)) + 1, [len(number)]]).tolist()
-    return [(a, b) for a, b in itertools.pairwise(cuts) if b > a]
 
 
 @dataclass(frozen=True)
@@ -117,26 +90,45 @@ def _read_object(store: formats.Store, key: tuple[int, str, bool], material: Mat
     body = make_body(
         position, read(f"{prefix}mesh/normal"), face, key[2], read(f"{prefix}mesh/texture"), material, order
     )
-    radii, valid = read(f"{prefix}radii"), read(f"{prefix}valid")
-    proxies = read(f"{prefix}proxies")
+    kept = read_field(store, prefix)
     used = position[np.unique(face)]
     own = Surroundings(
-        make_grid(radii, round(math.sqrt(valid.shape[1] / 6)), valid),
+        make_grid(kept.radii, kept.resolution, kept.valid),
         body.center,
         np.stack([used.min(axis=0), used.max(axis=0)]),
         body.radius,
-        read(f"{prefix}occlusion").reshape(-1, order * order),
-        StoredTransfer(store.array(f"{prefix}transfer")),
+        kept.occlusion,
+        kept.transfer,
         None,
-        proxies,
+        kept.proxies,
     )
-    albedo = np.broadcast_to(np.array(material.diffuse, np.float32), body.albedo.shape)  # texture acts in the picture
-    receivers = make_receivers(body.normal, albedo, order, read(f"{prefix}self"), body.terms > 1)
     colour = pack_materials([material]).parameters[0, SPECULAR : SPECULAR + 3].astype(np.float32)
     chosen = np.unique(np.linspace(0, len(body.point) - 1, SITES).astype(int))
     on_surface = body.point[chosen]
-    sites = np.concatenate([proxies, on_surface + INWARDS * (body.center - on_surface)])
-    return body, own, Tracer(body.positions, body.faces), receivers, colour, sites, between(body.point, on_surface)
+    sites = np.concatenate([kept.proxies, on_surface + INWARDS * (body.center - on_surface)])
+    return (
+        body,
+        own,
+        Tracer(body.positions, body.faces),
+        _receivers(body, kept, material),
+        colour,
+        sites,
+        between(body.point, on_surface),
+    )
+
+
+def _receivers(body: Body, kept: KeptField, material: Material) -> Receivers:
+    """What the points make of light; their texture acts in the picture."""
+    to_diffuse = kept.self_diffuse * np.array(material.diffuse, np.float32)
+    to_frame = np.zeros((0, body.order**2, body.order**2, 1), np.float32)
+    if kept.self_whole is not None:
+        to_frame = np.empty_like(kept.self_whole)
+        frames = axes(body.normal)
+        for a in range(0, len(to_frame), _SLAB):
+            part = slice(a, a + _SLAB)
+            turns = rotation_matrices(frames[part], body.order)
+            to_frame[part] = np.einsum("pki,pijc->pkjc", turns, kept.self_whole[part])
+    return Receivers(to_diffuse, to_frame, body.normal)
 
 
 def read_lights(store: formats.Store, lights: dict[str, SphereLight | RectangleLight]) -> dict[str, Surroundings]:
