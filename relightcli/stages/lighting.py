@@ -104,7 +104,12 @@ def need_still(store: formats.Store) -> None:
 
 
 class LightingStore:
-    """An open transfer store. Reads what it needs when it needs it; keeps small visibility in memory."""
+    """An open transfer store. Reads what it needs when it needs it; keeps small visibility in memory.
+
+    apart: whether the entries of `exit_radiance` are wanted one by one, or no more than their sum.
+    """
+
+    apart = True
 
     def __init__(self, store: Path | formats.Store, threads: int) -> None:
         self.store = formats.open_store(store) if isinstance(store, Path) else store
@@ -128,6 +133,7 @@ class LightingStore:
         self._gathered: dict[int, Gather] = {}
         self._seen: list[tuple[int, Gather]] | None = None
         self._coated: tuple[dict[str, Material], _Coats] | None = None
+        self._cubes: tuple[tuple[object, ...], SkyCube] | None = None
         self._bits: Future[NDArray[np.uint8]] | None = None
         if "visibility/bits" in self.store:
             layout = self.store.layouts["visibility/bits"]
@@ -268,7 +274,7 @@ class LightingStore:
         basis: str,
     ) -> Radiance:
         """Light that is reflected once: diffuse of `active` receivers, specular of those `looked_at` (None: all)."""
-        sky = latlong_to_cube(environment, self.resolution, rotate)
+        sky = self._cube(environment, self.resolution, rotate)
         material, table, partner = coats.material, coats.table, coats.partner
         if partner is not None and active is not None:
             active = active | active[partner]  # light comes through from the other side
@@ -284,6 +290,13 @@ class LightingStore:
         if lamps is not None:
             specular += lamps * table.parameters[material][:, SPECULAR : SPECULAR + 3].astype(np.float32)
         return Radiance(diffuse, specular)
+
+    def _cube(self, environment: NDArray[np.float32], resolution: int, rotate: float) -> SkyCube:
+        """The map as a cube, kept while the same array is asked for."""
+        key = (environment, resolution, rotate)
+        if self._cubes is None or self._cubes[0][0] is not environment or self._cubes[0][1:] != key[1:]:
+            self._cubes = key, latlong_to_cube(environment, resolution, rotate)
+        return self._cubes[1]
 
     def _exact_specular(
         self,

@@ -16,26 +16,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 import relight_formats as formats
+from relightcli.adapters.meshes import MAX_COORDINATE
 from relightcli.adapters.rays import Tracer
 from relightcli.core.brdf.models import SPECULAR
 from relightcli.core.brdf.separable import POLAR
 from relightcli.core.fields.body import clamped_cosine
-from relightcli.core.fields.chain import EVEN, light_at, open_rows, passing, put_reflections
-from relightcli.core.fields.close import Close, add_samples, covered, look_close, sent
+from relightcli.core.fields.chain import EVEN, light_at, put_reflections
+from relightcli.core.fields.close import sent
 from relightcli.core.fields.dimmed import dim, may_block, sky_basis, sky_terms
-from relightcli.core.fields.entities import Entity, Lookup, look_up
 from relightcli.core.fields.shade import diffuse, never_negative, specular
 from relightcli.core.fields.standing import (
     CELLS,
-    Views,
+    Between,
     light_from_lobes,
     light_from_sky,
     light_from_surfaces,
-    look_around,
     sky_cells,
-    unhidden,
 )
-from relightcli.core.lights.environment import SkyCube, latlong_to_cube, splat
+from relightcli.core.lights.environment import SkyCube, splat
 from relightcli.core.shade.bounces import Exit
 from relightcli.core.shade.gather import Gather
 from relightcli.core.shade.lobe_factors import LobeFactors
@@ -45,10 +43,11 @@ from relightcli.core.transport.light_visibility import light_bits
 from relightcli.core.transport.local_lights import LocalLights, pack_lights
 from relightcli.core.transport.transfer import local_rotations
 from relightcli.errors import InputError
-from relightcli.scene.model import Material
+from relightcli.scene.model import Geometry, Material
 from relightcli.scene.moving import apply_moves, inverse_affine, move_geometry
 from relightcli.stages.lighting import LightingStore, Radiance, _Coats
 from relightcli.stages.placed import Mover, light_entity, read_lights, read_movers
+from relightcli.stages.placement import Placement, Sites, ball, place
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -56,37 +55,26 @@ SLAB = 8192  # receivers whose sky terms are made at a time
 
 
 @dataclass
-class _Placed:
-    """Everything that hangs on where things are, and on nothing else.
+class _Passed:
+    """Light on its way in one picture: at the proxies after the last reflection, (P, 3, N); and, of all reflections so
+    far together, that which was reflected again, at the proxies, at the sites from behind (S, 3, N), and what the
+    samples send that are read early, and the close points', in rows as `chain.open_rows` has them."""
 
-    Targets, where light is looked up: the standing receivers, then of every mover its proxies and its points.
-    entities: the movers, then the local lights; rows: their samples' (`chain.open_rows`), emitted light included;
-    close: per mover its close points, and their rows; targets: slices of every mover's proxies and points;
-    passed (n, N): what all movers let pass to the standing receivers; covered (receivers,): what nothing can see;
-    views: what stands, from each mover's sites; thinned: the lookup with what stands before an entity taken off its
-    weight; gather of the standing receivers, light_bits of all, once they are needed.
-    """
-
-    entities: list[Entity]
-    points: F64
-    lookup: Lookup
+    at_proxies: F32
+    reflected: F32
+    behind: F32
     rows: F32
-    close: list[tuple[Close, slice]]
-    targets: list[tuple[slice, slice]]
-    passed: F32
-    covered: NDArray[np.bool_]
-    views: list[Views]
-    thinned: Lookup
-    gather: Gather | None = None
-    light_bits: NDArray[np.uint8] | None = None
 
 
 class MovingStore(LightingStore):
     """An open store with fields, with the interface of `LightingStore`."""
 
+    _moved: Geometry | None
+
     def __init__(self, store: Path | formats.Store, threads: int) -> None:
         super().__init__(store, threads)
-        self.movers: list[Mover] = read_movers(self.store, self.scene.materials, self.scene.objects)
+        movers = read_movers(self.store, self.scene.materials, self.scene.objects)
+        self.movers: list[Mover] = sorted(movers, key=lambda mover: mover.rows.start)
         self.order = int(self.store.settings["fields"]["order"])
         self.static = min(mover.rows.start for mover in self.movers)
         self._rest = self.geometry, self.position, self.normal
@@ -95,11 +83,15 @@ class MovingStore(LightingStore):
         keep = ~np.isin(self.geometry.face_object, [self.geometry.object_names.index(m.name) for m in self.movers])
         self._faces = self.geometry.faces[keep]
         self._still = Tracer(self.geometry.positions, self._faces)
-        self._placed: _Placed | None = None
-        self._seen_from: dict[tuple[str, bytes], Views] = {}
+        self._placed: Placement | None = None
+        # Without a mesh that is seen from pixels there is a receiver for every vertex that anything can see.
+        self._sides = self.receiver_of_vertex()
+        self._sites = Sites(self.movers)
         self._sky: tuple[NDArray[np.float64], F32, NDArray[np.float64]] | None = None
         self._bits_of_lights: dict[tuple[object, ...], NDArray[np.uint8]] = {}
-        self._at_proxies: list[F32] = []
+        self._passed: _Passed | None = None
+        self._cosines: F32 | None = None  # of the standing receivers
+        self._whole: tuple[F64, NDArray[np.bool_], str, F32] | None = None
 
     def set_moves(self, moves: tuple[str, ...]) -> list[str]:
         """Puts objects and local lights where `--move` says, those not named where the scene file has them.
@@ -108,16 +100,29 @@ class MovingStore(LightingStore):
         """
         geometry, position, normal = self._rest
         now = apply_moves(self.scene, moves)
-        moved = move_geometry(geometry, self.scene, now)
         position, normal = position.copy(), normal.copy()
         for mover in self.movers:
             entity = mover.at(self._matrix(mover, now.objects[mover.name].transform))
             turn = entity.rotation
             position[mover.rows] = entity.scale * (mover.body.point @ turn.T) + entity.translation
             normal[mover.rows] = mover.body.normal @ turn.T
-        self._now, self.geometry, self.position, self.normal = now, moved, position, normal
-        self._placed = None
+            center, radius = ball(entity)
+            if np.abs(center).max() + radius > MAX_COORDINATE:
+                move_geometry(geometry, self.scene, now)  # which says what is wrong, if it is
+        self._now, self.position, self.normal = now, position, normal
+        self._moved = self._placed = None
         return []
+
+    @property
+    def geometry(self) -> Geometry:
+        """The mesh where things are now; made when it is asked for."""
+        if self._moved is None:
+            self._moved = move_geometry(self._rest[0], self.scene, self._now)
+        return self._moved
+
+    @geometry.setter
+    def geometry(self, value: Geometry) -> None:
+        self._moved = value
 
     def _matrix(self, mover: Mover, transform: F64) -> F64:
         """From the field's frame to the world, after a move to `transform`."""
@@ -143,7 +148,10 @@ class MovingStore(LightingStore):
                     f"--set {mover.material}: is the material of {mover.name!r}, which moves: its fields hold for the "
                     "material in the scene file. Change it there and precompute again, or add --reference."
                 )
-        return super().exit_radiance(environment, rotate, materials, view, active, basis, bounces)
+        parts = super().exit_radiance(environment, rotate, materials, view, active, basis, bounces)
+        if not self.apart:
+            self._light_together(parts[0], view)
+        return parts
 
     def buried(self) -> NDArray[np.bool_]:
         """See `LightingStore.buried`. What a mover stands on cannot be seen either."""
@@ -151,62 +159,26 @@ class MovingStore(LightingStore):
 
     # -- where things are
 
-    def _where(self) -> _Placed:
+    def _where(self) -> Placement:
         if self._placed is None:
-            self._placed = self._place()
+            entities = [m.at(self._matrix(m, self._now.objects[m.name].transform)) for m in self.movers]
+            lights = [light_entity(self._sources[k], self.scene.lights[k], v) for k, v in self._now.lights.items()]
+            seen = self._sites.look(entities, self._still, self._rest[0].positions, self._faces, self._sides)
+            self._placed = place(
+                self.movers,
+                lights,
+                entities,
+                self.position,
+                self.normal,
+                super().buried(),
+                self.static,
+                seen[0],
+                self._sites,
+                seen[1],
+                self.order,
+                self.threads,
+            )
         return self._placed
-
-    def _place(self) -> _Placed:
-        entities = [m.at(self._matrix(m, self._now.objects[m.name].transform)) for m in self.movers]
-        entities += [light_entity(self._sources[k], self.scene.lights[k], v) for k, v in self._now.lights.items()]
-        points, skip, targets = [self.position[: self.static]], [np.full(self.static, -1)], []
-        at = self.static
-        for e, mover in enumerate(self.movers):
-            own = entities[e].proxies, self.position[mover.rows]
-            points += own
-            middle, end = at + len(own[0]), at + len(own[0]) + len(own[1])
-            skip.append(np.full(end - at, e))
-            targets.append((slice(at, middle), slice(middle, end)))
-            at = end
-        places, without = np.concatenate(points), np.concatenate(skip).astype(np.int32)
-        lookup = look_up(entities, places, without, self.threads)
-        rows = open_rows(entities, lookup, self.order, threads=self.threads)
-        close = []
-        hidden = super().buried().copy()
-        for e, mover in enumerate(self.movers):
-            found = look_close(entities[e], e, mover.body, mover.tracer, places, lookup)
-            lookup, rows, where = add_samples(lookup, rows, found, e, entities[e].turn(self.order))
-            close.append((found, where))
-            under = found.target[found.target < self.static]
-            part = covered(found, self.normal[under], entities[e].rotation)
-            hidden[under[part]] = True
-        views = [self._views_of(mover, entities[e]) for e, mover in enumerate(self.movers)]
-        weight = lookup.weight.copy()
-        for (proxies, on), mover, entity, seen in zip(targets, self.movers, entities, views, strict=False):
-            for other, thing in enumerate(entities):
-                if thing is entity:
-                    continue
-                sites = _in_world(entity, mover.sites)
-                share = unhidden(seen, sites, *_ball(thing))
-                weight[proxies, other] *= share[: mover.proxies, None]
-                weight[on, other] *= mover.spread.blend(share[mover.proxies :, None])
-        passed = passing(_part(lookup, slice(0, self.static)), _dark(rows), self.threads)
-        return _Placed(
-            entities, places, lookup, rows, close, targets, passed, hidden, views, lookup._replace(weight=weight)
-        )
-
-    def _views_of(self, mover: Mover, entity: Entity) -> Views:
-        """What stands, from the sites of an object; the last place of each is kept."""
-        key = mover.name, np.concatenate([entity.rotation.ravel(), entity.translation, [entity.scale]]).tobytes()
-        if key not in self._seen_from:
-            for old in [k for k in self._seen_from if k[0] == mover.name]:
-                del self._seen_from[old]
-            # Without a mesh that is seen from pixels there is a receiver for every vertex that anything can see.
-            front, back = self.receiver_of_vertex()
-            sites = _in_world(entity, mover.sites)
-            geometry = self.geometry
-            self._seen_from[key] = look_around(self._still, geometry.positions, self._faces, front, back, sites)
-        return self._seen_from[key]
 
     # -- light of the sky and the local lights
 
@@ -229,7 +201,9 @@ class MovingStore(LightingStore):
         out = np.zeros((len(self), 3), np.float32)
         if not still.any():
             return out
-        whole = super()._irradiance(sky, still, basis)[: self.static]
+        if self._whole is None or not _same(self._whole[:3], (sky.flux, still, basis)):
+            self._whole = sky.flux, still, basis, super()._irradiance(sky, still, basis)[: self.static]
+        whole = self._whole[3]
         terms, _ = self._sky_terms(sky)
         hidden = -self._where().passed
         hidden[:, 0] += EVEN
@@ -248,40 +222,91 @@ class MovingStore(LightingStore):
         basis: str,
     ) -> Radiance:
         found = super()._direct(environment, rotate, coats, view, looked_at, active, basis)
-        sky = latlong_to_cube(environment, self.resolution, rotate)
+        sky = self._cube(environment, self.resolution, rotate)
         _, cells = self._sky_terms(sky)
         placed = self._where()
-        from_sky = [light_from_sky(views, cells) for views in placed.views]
-        self._light_movers(placed, placed.rows, from_sky, view, found.diffuse, found.specular)
+        behind = light_from_sky(placed.views, cells, self.threads)
+        count = placed.proxies.stop - placed.proxies.start
+        nothing = np.zeros((count, 3, self.order**2), np.float32)
+        self._passed = _Passed(nothing, nothing.copy(), np.zeros_like(behind), placed.rows.copy())
+        self._pass_on(placed, placed.rows, behind, view, found)
         return found
 
-    def _light_movers(
+    def _at(
         self,
-        placed: _Placed,
+        placed: Placement,
+        targets: slice | NDArray[np.int64],
         rows: F32,
-        behind: list[F32],
-        view: NDArray[np.float32] | None,
-        out: F32,
-        shine: F32 | None,
+        far: F32,
+        spread: Between | None = None,
+    ) -> F32:
+        """Light at targets. See `chain.light_at`."""
+        return light_at(
+            placed.lookup.points(targets),
+            rows,
+            far,
+            self.threads,
+            placed.share_of(targets),
+            spread,
+            1.0 / self.order**2,
+            np.arange(len(placed.entities)) >= len(self.movers),
+        )
+
+    def _pass_on(
+        self, placed: Placement, rows: F32, behind: F32, view: NDArray[np.float32] | None, out: Radiance
     ) -> None:
-        """Exit radiance of the movers into out and shine, and light at their proxies; behind: at each one's sites, what
-        comes from behind all other entities."""
-        self._at_proxies = []
-        for e, (mover, entity) in enumerate(zip(self.movers, placed.entities, strict=False)):
-            both = slice(placed.targets[e][0].start, placed.targets[e][1].stop)
-            far = np.concatenate([behind[e][: mover.proxies], mover.spread.blend(behind[e][mover.proxies :])])
-            light = light_at(_part(placed.thinned, both), rows, far, self.threads)
-            self._at_proxies.append(light[: mover.proxies])
-            own = np.ascontiguousarray(light[mover.proxies :])
-            turn = entity.turn(self.order)
-            out[mover.rows] = never_negative(diffuse(mover.receivers, own, turn, self.threads))[0]
-            if shine is None:
+        """Light at the proxies, of rows and, from behind all, at the sites; and exit radiance of the movers into out:
+        of all points where reflections are wanted apart, else of those that close points see."""
+        passed = self._passed
+        assert passed is not None
+        passed.at_proxies = self._at(placed, placed.proxies, rows, behind[self._sites.on_proxy])
+        passed.behind += behind
+        if self.apart:
+            self._light_points(placed, rows, behind, None, view, out)
+        elif len(placed.shown):
+            self._light_points(placed, rows, behind, placed.shown, None, out)
+
+    def _light_together(self, out: Radiance, view: NDArray[np.float32] | None) -> None:
+        """Exit radiance of the movers' points, of all reflections, into out."""
+        placed, passed = self._where(), self._passed
+        assert passed is not None
+        lights, late = self._lights(passed.reflected), ~placed.early
+        put_reflections(passed.rows, placed.entities, placed.lookup, lights, threads=self.threads, wanted=late)
+        self._light_points(placed, passed.rows, passed.behind, None, view, out)
+
+    def _light_points(
+        self,
+        placed: Placement,
+        rows: F32,
+        behind: F32,
+        chosen: NDArray[np.int64] | None,
+        view: NDArray[np.float32] | None,
+        out: Radiance,
+    ) -> None:
+        """Exit radiance of the movers' points, or of the chosen receivers of theirs (rising), into out."""
+        start, spread = placed.points.start - self.static, self._sites.spread
+        if chosen is None:
+            light = self._at(placed, placed.points, rows, behind, spread=spread)
+        else:
+            own = chosen - self.static
+            some = Between(spread.site[own], spread.weight[own])
+            light = self._at(placed, chosen + start, rows, behind, spread=some)
+        shine = out.specular
+        for mover, entity in zip(self.movers, placed.entities, strict=False):
+            receivers, turn = mover.receivers, entity.turn(self.order)
+            where: slice | NDArray[np.int64] = mover.rows
+            part = light[mover.rows.start - self.static : mover.rows.stop - self.static]
+            if chosen is not None:
+                a, b = np.searchsorted(chosen, [mover.rows.start, mover.rows.stop])
+                where, part = chosen[a:b], light[a:b]
+                receivers = receivers._replace(to_diffuse=receivers.to_diffuse[where - mover.rows.start])
+            out.diffuse[where] = never_negative(diffuse(receivers, part, turn, self.threads))[0]
+            if shine is None or chosen is not None:
                 continue
             shine[mover.rows] = 0.0
             if mover.body.terms > 1 and view is not None:
                 towards = np.ascontiguousarray(view[mover.rows] @ entity.rotation, np.float32)
-                lobe = mover.body.lobe
-                lit = specular(mover.receivers, own, turn, towards, lobe, mover.colour, self.threads)
+                lit = specular(receivers, part, turn, towards, mover.body.lobe, mover.colour, self.threads)
                 shine[mover.rows] = never_negative(lit)[0]
 
     def _exact_specular(
@@ -317,7 +342,7 @@ class MovingStore(LightingStore):
             near = np.zeros(n, bool)
             for light in placed.entities[len(self.movers) :]:
                 for mover in placed.entities[: len(self.movers)]:
-                    near |= may_block(self.position[:n], *_ball(light), *_ball(mover))
+                    near |= may_block(self.position[:n], *ball(light), *ball(mover))
             rows = np.flatnonzero(near)
             own = np.isin(self.geometry.face_object, [self.geometry.object_names.index(m.name) for m in self.movers])
             tracer = Tracer(self.geometry.positions, self.geometry.faces[own])
@@ -339,8 +364,10 @@ class MovingStore(LightingStore):
 
     def _irradiance_of(self, light: F32) -> F32:
         """Irradiance (n, 3) of the standing receivers under light (n, 3, N), past nothing."""
-        factors = sh.harmonics(self.normal[: self.static].astype(np.float64), self.order) * clamped_cosine(self.order)
-        out: F32 = np.maximum((light * factors[:, None, :].astype(np.float32)).sum(axis=2), 0.0)
+        if self._cosines is None:
+            y = sh.harmonics(self.normal[: self.static].astype(np.float64), self.order)
+            self._cosines = (y * clamped_cosine(self.order)).astype(np.float32)
+        out: F32 = np.maximum((light * self._cosines[:, None, :]).sum(axis=2), 0.0)
         return out
 
     # -- light that was reflected
@@ -368,7 +395,7 @@ class MovingStore(LightingStore):
         if not last:
             placed.gather = own
             return own
-        centers, radii = (np.array(x) for x in zip(*(_ball(e) for e in placed.entities), strict=True))
+        centers, radii = (np.array(x) for x in zip(*(ball(e) for e in placed.entities), strict=True))
         hidden = np.zeros((n, len(placed.entities), self.order**2), np.float32)
         for e in range(len(self.movers)):
             weight = placed.lookup.weight[:n, e]
@@ -377,7 +404,10 @@ class MovingStore(LightingStore):
             for k in range(weight.shape[1]):
                 hidden[:, e] -= weight[:, k, None] * rows[placed.lookup.place[:n, e, k]]
         placed.gather, share = dim(own, self.position, hidden, centers, radii, self.threads)
-        placed.thinned.weight[:n] *= share[:, :, None]
+        if (share < 1.0).any():
+            if placed.share is None:
+                placed.share = np.ones((len(placed.lookup.place), len(placed.entities)), np.float32)
+            placed.share[:n] = share
         return placed.gather
 
     def _reflected(
@@ -390,31 +420,37 @@ class MovingStore(LightingStore):
         specular: NDArray[np.float32],
     ) -> NDArray[np.float32]:
         """See `LightingStore._reflected`: the movers' light is added, and theirs is made."""
-        placed, n = self._where(), self.static
-        rows = placed.rows.copy()
-        rows[:, 1:] = 0.0
-        put_reflections(rows, placed.entities, placed.lookup, self._lights(placed), threads=self.threads)
-        for (close, where), mover, entity in zip(placed.close, self.movers, placed.entities, strict=False):
-            rows[where, 1:] = sent(close, mover.body, light.diffuse[mover.rows], entity.turn(self.order))
-        none = np.zeros((3, self.order**2))
-        arriving = light_at(_part(placed.thinned, slice(0, n)), rows, none, self.threads)
+        placed, n, passed = self._where(), self.static, self._passed
+        assert passed is not None
+        rows = placed.work
+        wanted = None if self.apart else placed.early
+        lights = self._lights(passed.at_proxies)
+        passed.reflected += passed.at_proxies
+        put_reflections(rows, placed.entities, placed.lookup, lights, threads=self.threads, wanted=wanted)
+        for k, (close, where) in enumerate(zip(placed.close, placed.where, strict=True)):
+            if not len(close.target):
+                continue
+            mover, turn = self.movers[k], placed.entities[k].turn(self.order)
+            rows[where, 1:] = sent(close, mover.body, light.diffuse[mover.rows], turn)
+        if not self.apart:
+            passed.rows[:, 1:] += rows[:, 1:]
+        none = np.zeros((3, self.order**2), np.float32)
+        arriving = self._at(placed, placed.still, rows, none)
         e[:n] += self._irradiance_of(arriving)
         out = coats.diffuse(e)
         if view is not None:
             self._mirror(coats, view, arriving, specular)
-        behind = []
-        for views in placed.views:
-            behind.append(light_from_surfaces(views, light.diffuse, self.order, placed.covered))
-            if len(light.lobe):
-                normals, material = self.normal, coats.material
-                behind[-1] += light_from_lobes(views, light, normals, material, factors, self.order, placed.covered)
-        self._light_movers(placed, rows, behind, view, out, specular)
+        behind = light_from_surfaces(placed.views, light.diffuse, self.order, placed.covered, self.threads)
+        if len(light.lobe):
+            normals, material = self.normal, coats.material
+            behind += light_from_lobes(placed.views, light, normals, material, factors, self.order, placed.covered)
+        self._pass_on(placed, rows, behind, view, Radiance(out, specular))
         return out
 
-    def _lights(self, placed: _Placed) -> list[F32]:
+    def _lights(self, at_proxies: F32) -> list[F32]:
         """Light at the proxies of every entity; local lights have none."""
-        nothing = np.zeros((0, 3, self.order**2), np.float32)
-        return [*self._at_proxies, *[nothing] * (len(placed.entities) - len(self.movers))]
+        cuts = np.cumsum([mover.proxies for mover in self.movers])
+        return [*np.split(at_proxies, cuts)[:-1], *[at_proxies[:0]] * len(self._now.lights)]
 
     def _mirror(self, coats: _Coats, view: NDArray[np.float32], arriving: F32, out: F32) -> None:
         """Adds what shiny standing receivers send of the movers' light to out (N, 3)."""
@@ -440,21 +476,5 @@ class MovingStore(LightingStore):
         out[rows] += np.maximum(found, 0.0)
 
 
-def _in_world(entity: Entity, points: F64) -> F64:
-    out: F64 = entity.scale * (points @ entity.rotation.T) + entity.translation
-    return out
-
-
-def _ball(entity: Entity) -> tuple[F64, float]:
-    """Centre and radius of the bounding sphere in the world."""
-    return _in_world(entity, entity.own.center[None])[0], entity.scale * entity.own.radius
-
-
-def _part(lookup: Lookup, rows: slice) -> Lookup:
-    return lookup._replace(place=lookup.place[rows], weight=lookup.weight[rows], nearest=lookup.nearest[rows])
-
-
-def _dark(rows: F32) -> F32:
-    out = rows.copy()
-    out[:, 1:] = 0.0
-    return out
+def _same(one: tuple[Any, ...], two: tuple[Any, ...]) -> bool:
+    return all(np.array_equal(a, b) for a, b in zip(one, two, strict=True))

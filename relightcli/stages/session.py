@@ -55,6 +55,7 @@ class Session:
     def __init__(self, lighting: LightingStore, config: Config) -> None:
         self.lighting = lighting
         self.config = config
+        lighting.apart = config.layers
         self.lighting_seconds = 0.0
         self.notes: list[str] = []
         self._views: dict[str, _View] = {}

@@ -21,6 +21,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.fields.entities import Entity, Lookup, look_up
+from relightcli.core.fields.standing import Between
 from relightcli.core.shade.gather import in_parts
 from relightcli.core.sphere.triple_product import coefficients
 from relightcli.core.sphere.window import window
@@ -62,9 +63,10 @@ def put_reflections(
     lights: list[NDArray[np.float32]],
     windowed: float = 0.0,
     threads: int = 1,
+    wanted: NDArray[np.bool_] | None = None,
 ) -> None:
     """Puts what the entities reflect of lights (m, 3, N), in the world's frame, at each one's proxies into the rows:
-    once for every sample, however many points read it. [Pan 2007, Eq. 11]"""
+    once for every sample, however many points read it; wanted (T,): into these rows only. [Pan 2007, Eq. 11]"""
     order = math.isqrt(rows.shape[2])
 
     def put(e: int) -> None:
@@ -72,11 +74,19 @@ def put_reflections(
         if transfer is None:
             return
         turn = entities[e].turn(order)
-        seen = transfer.reflect(lights[e] @ turn.astype(np.float32), lookup.sample[part])
+        which = lookup.sample[part]
+        own = slice(None) if wanted is None else np.flatnonzero(wanted[part])
+        seen = transfer.reflect(_times_each(lights[e], turn.astype(np.float32)), which[own])
         back = (turn * window(order, windowed)).T.astype(np.float32, order="C")
-        rows[part, 1:] = _times(seen.reshape(-1, order * order), back).reshape(seen.shape)
+        rows[part][own, 1:] = _times(seen.reshape(-1, order * order), back).reshape(seen.shape)
 
     in_parts(lambda a, b: _each(put, a, b), len(entities), threads)
+
+
+def _times_each(values: NDArray[np.float32], matrix: NDArray[np.float32]) -> NDArray[np.float32]:
+    flat = np.ascontiguousarray(values, np.float32).reshape(-1, values.shape[-1])
+    out: NDArray[np.float32] = _times(flat, matrix).reshape(values.shape)
+    return out
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
@@ -114,9 +124,24 @@ def incident(
 
 
 def light_at(
-    lookup: Lookup, rows: NDArray[np.float32], far: NDArray[np.floating], threads: int = 1
+    lookup: Lookup,
+    rows: NDArray[np.float32],
+    far: NDArray[np.floating],
+    threads: int = 1,
+    share: NDArray[np.float32] | None = None,
+    spread: Between | None = None,
+    merged: float = 0.0,
+    alone: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float32]:
-    """L_q (n, 3, N) float32 in the world's frame; far (3, N), or (n, 3, N), is what comes from behind all entities."""
+    """L_q (n, 3, N) float32 in the world's frame; far (3, N), or (n, 3, N), is what comes from behind all entities.
+
+    share (n, E): of each entity, what nothing else hides; None: all of it
+    spread: far (S, 3, N) is known at S sites, between which the points lie
+    merged: neighbours in the order that together hide no more than this of all directions count as one entity, that
+        hides what both do. Whatever lies behind both is then darkened by N a b at most, a and b what each hides, as if
+        they lay side by side; up to 1 / N the sum hides nothing twice as strongly as an entity can.
+    alone (E,): entities that are never merged: a small lamp is not hidden in part
+    """
     count, n = len(lookup.place), rows.shape[2]
     behind = np.ascontiguousarray(far, np.float32).reshape(-1, 3, n)
     out = np.empty((count, 3, n), np.float32)
@@ -125,59 +150,117 @@ def light_at(
     factors = table.i.astype(np.uint64), table.j.astype(np.uint64), table.value.astype(np.float32)
     terms = np.searchsorted(table.k, np.arange(n + 1))
     flat = rows.reshape(len(rows), 4 * n)
+    part_of = np.ones((1, lookup.place.shape[1]), np.float32) if share is None else share
+    site, mix = (np.zeros((1, 1), np.int64), np.ones((1, 1), np.float32)) if spread is None else spread
+    single = np.zeros(lookup.place.shape[1], np.bool_) if alone is None else alone
+    for_all = spread is None and len(behind) == 1
 
     def part(a: int, b: int) -> None:
-        own = behind if len(behind) == 1 else behind[a:b]
-        look = lookup.place[a:b], lookup.weight[a:b], lookup.nearest[a:b]
-        _chain(*look, flat, own, terms, *factors, out[a:b])
+        p, q = a * LANES, min(b * LANES, count)
+        own = behind if for_all or spread is not None else behind[p:q]
+        look = lookup.place[p:q], lookup.weight[p:q], lookup.nearest[p:q]
+        shares = part_of if share is None else part_of[p:q]
+        sites = (site, mix) if spread is None else (site[p:q], mix[p:q])
+        _chain(*look, shares, flat, own, spread is not None, *sites, merged, single, terms, *factors, out[p:q])
 
-    in_parts(part, count, threads if count > 32 * LANES else 1)  # a few points fill no lanes when they are split
+    # Whole groups of lanes: a few points fill no lanes when they are split.
+    groups = -(-count // LANES)
+    in_parts(part, groups, threads if groups > 32 else 1)
     return out
 
 
-def passing(lookup: Lookup, rows: NDArray[np.float32], threads: int = 1) -> NDArray[np.float32]:
-    """What all entities together let pass of even light of radiance 1, (n, N) float32."""
-    dark = rows.copy()
-    dark[:, 1:] = 0.0
+def passing(lookup: Lookup, rows: NDArray[np.float32], threads: int = 1, merged: float = 0.0) -> NDArray[np.float32]:
+    """What all entities together let pass of even light of radiance 1, (n, N) float32; merged: see `light_at`."""
+    dark = rows
+    if rows[:, 1:].any():
+        dark = rows.copy()
+        dark[:, 1:] = 0.0
     even = np.zeros((3, rows.shape[2]))
     even[0, 0] = EVEN
-    return light_at(lookup, dark, even, threads)[:, 0]
+    return light_at(lookup, dark, even, threads, merged=merged)[:, 0]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _chain(place, weight, nearest, rows, far, terms, ti, tj, value, out):  # type: ignore[no-untyped-def]
-    """LANES points at a time, one beside the other in memory, so that every step is one of vectors."""
+def _chain(  # type: ignore[no-untyped-def]
+    place, weight, nearest, share, rows, far, mixed, site, mix, merged, alone, terms, ti, tj, value, out
+):
+    """LANES points at a time, one beside the other in memory, so that every step is one of vectors. Every point has as
+    many steps as it needs: a group of entities each, from far to near."""
     n = out.shape[2]
     light, new = np.zeros((3, n, LANES), np.float32), np.empty((3, n, LANES), np.float32)
     row, seen = np.empty(4 * n, np.float32), np.zeros((4 * n, LANES), np.float32)
     total = np.empty((3, LANES), np.float32)
-    one, even = np.float32(1.0), np.float32(EVEN)
+    left = np.empty(LANES, np.int64)  # the furthest entity that is still to come
+    one, even, zero = np.float32(1.0), np.float32(EVEN), np.float32(0.0)
     for first in range(0, len(place), LANES):
         lanes = min(LANES, len(place) - first)
         for lane in range(lanes):
-            own = far[0] if len(far) == 1 else far[first + lane]
-            for c in range(3):
-                for k in range(n):
-                    light[c, k, lane] = own[c, k]
-        for rank in range(nearest.shape[1] - 1, -1, -1):
+            at = first + lane
+            left[lane] = nearest.shape[1] - 1
+            if mixed:
+                for c in range(3):
+                    for k in range(n):
+                        row[c * n + k] = zero
+                for s in range(site.shape[1]):
+                    w, own = mix[at, s], far[site[at, s]]
+                    for c in range(3):
+                        for k in range(n):
+                            row[c * n + k] += w * own[c, k]
+                for c in range(3):
+                    for k in range(n):
+                        light[c, k, lane] = row[c * n + k]
+            else:
+                own = far[0] if len(far) == 1 else far[at]
+                for c in range(3):
+                    for k in range(n):
+                        light[c, k, lane] = own[c, k]
+        going = lanes
+        while going > 0:
+            going = 0
             for lane in range(lanes):
+                if left[lane] < -1:  # done: its light has been written
+                    continue
                 at = first + lane
-                e = nearest[at, rank]
-                row[:] = 0.0
-                rest = one
-                if e >= 0:
-                    for s in range(8):
-                        w = weight[at, e, s]
-                        if w > 0.0:
-                            rest -= w
-                            sample = np.uint64(place[at, e, s])
-                            for k in range(4 * n):
-                                row[k] += w * rows[sample, k]
+                for k in range(4 * n):
+                    row[k] = zero
+                rest, hidden, taken, single = one, zero, False, False
+                while left[lane] >= 0:
+                    e = nearest[at, left[lane]]
+                    if e >= 0:
+                        part = share[0, e] if len(share) == 1 else share[at, e]
+                        own_hidden, used = zero, False
+                        for s in range(8):
+                            w = weight[at, e, s]
+                            if w > zero:
+                                used = True
+                                own_hidden += w * part * (one - rows[np.uint64(place[at, e, s]), 0] / even)
+                        if used:
+                            if taken and (single or alone[e] or hidden + own_hidden > merged):
+                                break
+                            taken, single = True, alone[e]
+                            hidden += own_hidden
+                            for s in range(8):
+                                w = weight[at, e, s] * part
+                                if w > zero:
+                                    rest -= w
+                                    sample = np.uint64(place[at, e, s])
+                                    for k in range(4 * n):
+                                        row[k] += w * rows[sample, k]
+                    left[lane] -= 1
+                if not taken:
+                    for c in range(3):
+                        for k in range(n):
+                            out[at, c, k] = light[c, k, lane]
+                    left[lane] = -2
+                    continue
+                going += 1
                 row[0] += rest * even
                 for k in range(4 * n):
                     seen[k, lane] = row[k]
+            if going == 0:
+                break
             for k in range(n):
-                total[:] = 0.0
+                total[:] = zero
                 for t in range(terms[k], terms[k + 1]):
                     i, j, v = ti[t], tj[t], value[t]
                     for lane in range(LANES):
@@ -189,7 +272,3 @@ def _chain(place, weight, nearest, rows, far, terms, ti, tj, value, out):  # typ
                     for lane in range(LANES):
                         new[c, k, lane] = seen[(c + 1) * n + k, lane] + total[c, lane]
             light, new = new, light
-        for lane in range(lanes):
-            for c in range(3):
-                for k in range(n):
-                    out[first + lane, c, k] = light[c, k, lane]

@@ -35,11 +35,14 @@ def look_close(
     entity: Entity, e: int, body: Body, tracer: Tracer, points: NDArray[np.float64], lookup: Lookup
 ) -> Close:
     """Rays from the points (n, 3) in the innermost shell of entity number e; tracer over its mesh."""
-    own = ((points - entity.translation) @ entity.rotation) / entity.scale
-    near = np.linalg.norm(own - entity.own.center, axis=1) < entity.own.grid.radii[0]
-    target = np.flatnonzero(near & (lookup.nearest == e).any(axis=1))
-    directions, weight = cone_rays(own[target], body.center, body.radius, RAYS, 0, 0)
-    found = trace(tracer, body, tracer.to_local(own[target]), directions, weight)
+    target = np.flatnonzero(lookup.inside[:, e])
+    own = ((points[target] - entity.translation) @ entity.rotation) / entity.scale
+    directions, weight = cone_rays(own, body.center, body.radius, RAYS, 0, 0)
+    found = trace(tracer, body, tracer.to_local(own), directions, weight)
+    n = body.order**2
+    none = np.zeros((0, n), np.float32)
+    if not len(target):
+        return Close(target, found, none)
     return Close(target, found, sh.harmonics(found.direction.astype(np.float64), body.order).astype(np.float32))
 
 
@@ -55,26 +58,28 @@ def covered(close: Close, normals: NDArray[np.float32], turn: NDArray[np.float64
 
 
 def add_samples(
-    lookup: Lookup,
-    rows: NDArray[np.float32],
-    close: Close,
-    e: int,
-    turn: NDArray[np.float64],
-) -> tuple[Lookup, NDArray[np.float32], slice]:
-    """Lookup and rows with a sample more for each close point, which reads nothing else of entity e; the new rows.
+    lookup: Lookup, rows: NDArray[np.float32], closes: list[Close], turns: list[NDArray[np.float64]]
+) -> tuple[NDArray[np.float32], list[slice]]:
+    """Rows with a sample more for each close point, which from now on reads nothing else of the entity that it is close
+    to: `lookup` is changed. Also where the new rows of every entity are.
 
-    turn (N, N) takes coefficients to the world's frame.
+    closes: those of the first entities; turns, each (N, N), take coefficients to the world's frame.
     """
-    new = np.zeros((len(close.target), *rows.shape[1:]), np.float32)
-    hidden = blocked(close.found, close.harmonics)
-    new[:, 0] = -hidden @ turn.T
-    new[:, 0, 0] += EVEN
-    place, weight = lookup.place.copy(), lookup.weight.copy()
-    weight[close.target, e] = 0.0
-    weight[close.target, e, 0] = 1.0
-    place[close.target, e, 0] = np.arange(len(rows), len(rows) + len(new))
-    where = slice(len(rows), len(rows) + len(new))
-    return lookup._replace(place=place, weight=weight), np.concatenate([rows, new]), where
+    more, where, at = [rows], [], len(rows)
+    for e, (close, turn) in enumerate(zip(closes, turns, strict=True)):
+        count = len(close.target)
+        where.append(slice(at, at + count))
+        if not count:
+            continue
+        new = np.zeros((count, *rows.shape[1:]), np.float32)
+        new[:, 0] = -blocked(close.found, close.harmonics) @ turn.T
+        new[:, 0, 0] += EVEN
+        more.append(new)
+        lookup.weight[close.target, e] = 0.0
+        lookup.weight[close.target, e, 0] = 1.0
+        lookup.place[close.target, e, 0] = np.arange(at, at + count)
+        at += count
+    return np.concatenate(more) if len(more) > 1 else rows, where
 
 
 def sent(close: Close, body: Body, exits: NDArray[np.float32], turn: NDArray[np.float64]) -> NDArray[np.float32]:

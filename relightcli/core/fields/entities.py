@@ -8,8 +8,8 @@ both hold the entity, and for boxes, walls and balls one of them is the surface.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import lru_cache
+import math
+from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.fields.field import Field, SourceField
-from relightcli.core.fields.interpolate import CORNERS, Grid, locate_one, make_grid
+from relightcli.core.fields.interpolate import CORNERS, Grid, locate_one, make_grid, shell_steps
 from relightcli.core.shade.gather import in_parts
 from relightcli.core.sphere.rotation import rotation_matrices
 
@@ -36,13 +36,44 @@ class PlainTransfer:
     transfer: NDArray[np.float32]
 
     def reflect(self, light: NDArray[np.floating], which: NDArray[np.integer]) -> NDArray[np.float32]:
-        _, m, n, _, colours = self.transfer.shape
-        own = self.transfer[which]
-        out = np.empty((len(which), 3, n), np.float32)
-        for c in range(3):
-            matrices = own[..., c % colours].transpose(0, 2, 1, 3).reshape(len(which) * n, m * n)
-            out[:, c] = (matrices @ light[:, c].reshape(-1).astype(np.float32)).reshape(len(which), n)
+        out = np.empty((len(which), 3, light.shape[2]), np.float32)
+        values = np.ascontiguousarray(light, np.float32)
+        _reflect(np.ascontiguousarray(self.transfer), np.asarray(which, np.int64), values, out)
         return out
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
+def _reflect(transfer, which, light, out):  # type: ignore[no-untyped-def]
+    """A matrix (n, n) at a time, entry beside entry; the light is laid out as these are."""
+    m, n, colours = transfer.shape[1], transfer.shape[2], transfer.shape[4]
+    flat = transfer.reshape(transfer.shape[0], m, n * n * colours)
+    laid = np.empty((m, 3, n * n), np.float32)
+    for k in range(m):
+        for c in range(3):
+            for i in range(n):
+                laid[k, c, i * n : (i + 1) * n] = light[k, c]
+    terms = np.empty((3, n * n), np.float32)
+    for r in range(len(which)):
+        terms[:] = np.float32(0.0)
+        for k in range(m):
+            own = flat[which[r], k]
+            red, green, blue = laid[k, 0], laid[k, 1], laid[k, 2]
+            if colours == 1:
+                for x in range(n * n):
+                    terms[0, x] += own[x] * red[x]
+                    terms[1, x] += own[x] * green[x]
+                    terms[2, x] += own[x] * blue[x]
+            else:
+                for x in range(n * n):
+                    terms[0, x] += own[3 * x] * red[x]
+                    terms[1, x] += own[3 * x + 1] * green[x]
+                    terms[2, x] += own[3 * x + 2] * blue[x]
+        for c in range(3):
+            for i in range(n):
+                total = np.float32(0.0)
+                for j in range(n):
+                    total += terms[c, i * n + j]
+                out[r, c, i] = total
 
 
 @dataclass(frozen=True)
@@ -96,6 +127,7 @@ class Entity:
     rotation: NDArray[np.float64]
     translation: NDArray[np.float64]
     scale: float = 1.0
+    turns: dict[int, NDArray[np.float64]] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def proxies(self) -> NDArray[np.float64]:
@@ -107,12 +139,15 @@ class Entity:
 
     def turn(self, order: int) -> NDArray[np.float64]:
         """(N, N): coefficients in the entity's frame to those in the world's."""
-        return _turn(np.ascontiguousarray(self.rotation, np.float64).tobytes(), order)
+        if order not in self.turns:
+            turn_together([self], order)
+        return self.turns[order]
 
 
-@lru_cache(maxsize=256)
-def _turn(rotation: bytes, order: int) -> NDArray[np.float64]:
-    return rotation_matrices(np.frombuffer(rotation).reshape(3, 3), order)
+def turn_together(entities: list[Entity], order: int) -> None:
+    """Makes the turns of all entities at once, which costs little more than one."""
+    for entity, turn in zip(entities, rotation_matrices(np.stack([e.rotation for e in entities]), order), strict=True):
+        entity.turns[order] = turn
 
 
 class Lookup(NamedTuple):
@@ -122,6 +157,7 @@ class Lookup(NamedTuple):
     start[e + 1], start (E + 1,)
     place (n, E, 8) int32 among them, weight (n, E, 8) float32
     nearest (n, E) int32: entities from near to far, one that is left out -1 at the end
+    inside (n, E) bool: points within the innermost shell of an entity that is not left out
     """
 
     sample: NDArray[np.int64]
@@ -129,9 +165,22 @@ class Lookup(NamedTuple):
     place: NDArray[np.int32]
     weight: NDArray[np.float32]
     nearest: NDArray[np.int32]
+    inside: NDArray[np.bool_]
 
     def part(self, e: int) -> slice:
         return slice(int(self.start[e]), int(self.start[e + 1]))
+
+    def points(self, rows: slice | NDArray[np.int64]) -> Lookup:
+        """The same for some of the points."""
+        return self._replace(
+            place=self.place[rows], weight=self.weight[rows], nearest=self.nearest[rows], inside=self.inside[rows]
+        )
+
+    def read(self, count: int) -> NDArray[np.bool_]:
+        """Which of the first `count` samples these points read, (count,)."""
+        found = np.zeros(count, np.bool_)
+        _mark(self.place, self.weight, found)
+        return found
 
 
 def look_up(entities: list[Entity], points: NDArray[np.floating], skip: NDArray[np.int32], threads: int = 1) -> Lookup:
@@ -142,13 +191,26 @@ def look_up(entities: list[Entity], points: NDArray[np.floating], skip: NDArray[
     place, weight = np.zeros((len(p), count, CORNERS), np.int32), np.zeros((len(p), count, CORNERS), np.float32)
     distance, nearest = np.empty((len(p), count)), np.empty((len(p), count), np.int32)
     read = np.zeros(int(first[-1]), np.bool_)
+    inside = np.zeros((len(p), count), np.bool_)
     skip = np.ascontiguousarray(skip, np.int32)
 
     def visit(a: int, b: int) -> None:
         for e, entity in enumerate(entities):
             own = entity.own
             frame = entity.rotation, entity.translation, float(entity.scale), own.center, own.box, float(own.radius)
-            _visit(p[a:b], skip[a:b], e, first[e], *frame, *own.grid, place[a:b], weight[a:b], distance[a:b], read)
+            _visit(
+                p[a:b],
+                skip[a:b],
+                e,
+                first[e],
+                *frame,
+                *own.grid,
+                place[a:b],
+                weight[a:b],
+                distance[a:b],
+                inside[a:b],
+                read,
+            )
         _order(distance[a:b], skip[a:b], nearest[a:b])
 
     in_parts(visit, len(p), threads)
@@ -157,38 +219,39 @@ def look_up(entities: list[Entity], points: NDArray[np.floating], skip: NDArray[
     number[found] = np.arange(len(found), dtype=np.int32)
     in_parts(lambda a, b: _renumber(number, weight[a:b], place[a:b]), len(p), threads)
     start = np.searchsorted(found, first)
-    return Lookup(found - np.repeat(first[:-1], np.diff(start)), start, place, weight, nearest)
+    return Lookup(found - np.repeat(first[:-1], np.diff(start)), start, place, weight, nearest, inside)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _visit(  # type: ignore[no-untyped-def]
     points, skip, e, start, rotation, translation, scale, center, box, radius, radii, logarithmic, padded, stand_in,
-    index, weight, distance, read,
+    index, weight, distance, inside, read,
 ):  # fmt: skip
-    q = np.empty(3)
+    squares, steps = shell_steps(radii, logarithmic)
+    # Into the entity's frame, about its centre: turned by the inverse, which is the transpose.
+    turn, t = rotation / scale, (translation[0], translation[1], translation[2])
+    low = (box[0, 0] - center[0], box[0, 1] - center[1], box[0, 2] - center[2])
+    high = (box[1, 0] - center[0], box[1, 1] - center[1], box[1, 2] - center[2])
     for i in range(len(points)):
         if skip[i] == e:
             distance[i, e] = np.inf
             continue
-        for x in range(3):
-            total = 0.0
-            for y in range(3):
-                total += rotation[y, x] * (points[i, y] - translation[y])
-            q[x] = total / scale
-        outside, inside, square = 0.0, -np.inf, 0.0
-        for x in range(3):
-            beyond = max(box[0, x] - q[x], q[x] - box[1, x])
-            inside = max(inside, beyond)
-            outside += max(beyond, 0.0) ** 2
-            q[x] -= center[x]
-            square += q[x] * q[x]
-        to_box = np.sqrt(outside) if outside > 0.0 else inside
-        distance[i, e] = scale * max(to_box, np.sqrt(square) - radius)
-        locate_one(q[0], q[1], q[2], radii, logarithmic, padded, stand_in, index[i, e], weight[i, e])
-        for k in range(index.shape[2]):
-            index[i, e, k] += start
-            if weight[i, e, k] > 0.0:
-                read[index[i, e, k]] = True
+        a, b, c = points[i, 0] - t[0], points[i, 1] - t[1], points[i, 2] - t[2]
+        x = turn[0, 0] * a + turn[1, 0] * b + turn[2, 0] * c - center[0]
+        y = turn[0, 1] * a + turn[1, 1] * b + turn[2, 1] * c - center[1]
+        z = turn[0, 2] * a + turn[1, 2] * b + turn[2, 2] * c - center[2]
+        square = x * x + y * y + z * z
+        bx, by, bz = max(low[0] - x, x - high[0]), max(low[1] - y, y - high[1]), max(low[2] - z, z - high[2])
+        outside = max(bx, 0.0) ** 2 + max(by, 0.0) ** 2 + max(bz, 0.0) ** 2
+        to_box = math.sqrt(outside) if outside > 0.0 else max(bx, by, bz)
+        distance[i, e] = scale * max(to_box, math.sqrt(square) - radius)
+        inside[i, e] = square < squares[0]
+        own, w = index[i, e], weight[i, e]
+        locate_one(x, y, z, radii, squares, steps, logarithmic, padded, stand_in, own, w)
+        for k in range(CORNERS):
+            own[k] += start
+            if w[k] > 0.0:
+                read[own[k]] = True
 
 
 @njit(cache=True, nogil=True)
@@ -212,3 +275,12 @@ def _renumber(number, weight, place):  # type: ignore[no-untyped-def]
         for e in range(place.shape[1]):
             for k in range(place.shape[2]):
                 place[i, e, k] = number[place[i, e, k]] if weight[i, e, k] > 0.0 else 0
+
+
+@njit(cache=True, nogil=True)
+def _mark(place, weight, found):  # type: ignore[no-untyped-def]
+    for i in range(place.shape[0]):
+        for e in range(place.shape[1]):
+            for k in range(place.shape[2]):
+                if weight[i, e, k] > 0.0 and place[i, e, k] < len(found):
+                    found[place[i, e, k]] = True

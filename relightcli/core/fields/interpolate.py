@@ -93,10 +93,19 @@ def blend(
 
 
 @njit(cache=True, nogil=True)
-def locate_one(x, y, z, radii, logarithmic, padded, stand_in, index, weight):  # type: ignore[no-untyped-def]
-    """The samples and weights of one point, into index and weight (8,)."""
+def shell_steps(radii, logarithmic):  # type: ignore[no-untyped-def]
+    """Squares of the radii, and 1 / the step from each to the next, in the measure that weights are linear in."""
+    squares, inverse = radii * radii, np.zeros(len(radii))
+    for k in range(len(radii) - 1):
+        inverse[k] = 1.0 / (math.log(radii[k + 1] / radii[k]) if logarithmic else radii[k + 1] - radii[k])
+    return squares, inverse
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def locate_one(x, y, z, radii, squares, inverse, logarithmic, padded, stand_in, index, weight):  # type: ignore[no-untyped-def]
+    """The samples and weights of one point, into index and weight (8,); squares, inverse from `shell_steps`."""
     n = padded.shape[1] - 2
-    distance = math.sqrt(x * x + y * y + z * z)
+    square = x * x + y * y + z * z
     ax, ay, az = abs(x), abs(y), abs(z)
     # Faces +X -X +Y -Y +Z -Z as in core.sphere.cube.
     if ax >= ay and ax >= az:
@@ -106,7 +115,8 @@ def locate_one(x, y, z, radii, logarithmic, padded, stand_in, index, weight):  #
     else:
         face, s, t, major = (4, x, -y, az) if z >= 0.0 else (5, -x, -y, az)
     if major > 0.0:
-        s, t = s / major, t / major
+        shrink = 1.0 / major
+        s, t = s * shrink, t * shrink
     else:
         s, t = 0.0, 0.0
     u, v = (s + 1.0) * 0.5 * n + 0.5, (t + 1.0) * 0.5 * n + 0.5  # in padded texels, whose centres are whole numbers
@@ -114,14 +124,15 @@ def locate_one(x, y, z, radii, logarithmic, padded, stand_in, index, weight):  #
     u, v = u - j, v - i
     last = len(radii) - 1
     low, along, fade = 0, 0.0, 1.0
-    if distance >= radii[last]:
-        low, fade = last, (radii[last] / distance) ** 2
-    elif distance > radii[0]:
-        low = int(np.searchsorted(radii, distance, side="right")) - 1
+    if square >= squares[last]:
+        low, fade = last, squares[last] / square
+    elif square > squares[0]:
+        while squares[low + 1] <= square:
+            low += 1
         if logarithmic:
-            along = math.log(distance / radii[low]) / math.log(radii[low + 1] / radii[low])
+            along = 0.5 * math.log(square / squares[low]) * inverse[low]
         else:
-            along = (distance - radii[low]) / (radii[low + 1] - radii[low])
+            along = (math.sqrt(square) - radii[low]) * inverse[low]
     high = min(low + 1, last)
     weight[0], weight[1] = (1.0 - u) * (1.0 - v), u * (1.0 - v)
     weight[2], weight[3] = (1.0 - u) * v, u * v
@@ -168,5 +179,7 @@ def locate_one(x, y, z, radii, logarithmic, padded, stand_in, index, weight):  #
 
 @njit(cache=True, nogil=True)
 def _locate(points, radii, logarithmic, padded, stand_in, index, weight):  # type: ignore[no-untyped-def]
+    squares, inverse = shell_steps(radii, logarithmic)
     for i in range(len(points)):
-        locate_one(points[i, 0], points[i, 1], points[i, 2], radii, logarithmic, padded, stand_in, index[i], weight[i])
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        locate_one(x, y, z, radii, squares, inverse, logarithmic, padded, stand_in, index[i], weight[i])

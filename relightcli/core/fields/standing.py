@@ -12,6 +12,7 @@ times w y_i, w the cell's solid angle. Points between sites take the nearest of 
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ from scipy.spatial import cKDTree
 from relightcli.core.brdf.separable import TERMS
 from relightcli.core.lights.environment import SkyCube
 from relightcli.core.shade.bounces import Exit
+from relightcli.core.shade.gather import in_parts
 from relightcli.core.shade.lobe_factors import LobeFactors, axes_of, send_lobe, waves
 from relightcli.core.sphere import cube, sh
 from relightcli.core.transport.tracer import Tracer
@@ -40,6 +42,22 @@ class Views(NamedTuple):
     share: NDArray[np.float32]
 
 
+@lru_cache(maxsize=1)
+def _directions() -> NDArray[np.float64]:
+    return cube.texel_directions(CELLS).reshape(-1, 3)
+
+
+@lru_cache(maxsize=1)
+def _solid_angles() -> NDArray[np.float64]:
+    return np.tile(cube.solid_angles(CELLS).reshape(-1), 6)
+
+
+@lru_cache(maxsize=4)
+def _weighed_harmonics(order: int) -> NDArray[np.float64]:
+    out: NDArray[np.float64] = sh.harmonics(_directions(), order) * _solid_angles()[:, None]
+    return out
+
+
 def look_around(
     tracer: Tracer,
     positions: NDArray[np.float64],
@@ -49,7 +67,7 @@ def look_around(
     sites: NDArray[np.float64],
 ) -> Views:
     """Traces from sites (S, 3); tracer over the mesh positions (V, 3), faces (F, 3); front, back (V,): receivers."""
-    directions = cube.texel_directions(CELLS).reshape(-1, 3).astype(np.float32)
+    directions = _directions().astype(np.float32)
     count = len(directions)
     origins = np.repeat(tracer.to_local(sites), count, axis=0)
     hits = tracer.intersect(origins, np.tile(directions, (len(sites), 1)))
@@ -91,15 +109,16 @@ def sky_cells(sky: SkyCube, order: int) -> NDArray[np.float64]:
     return out
 
 
-def light_from_sky(views: Views, cells: NDArray[np.float64]) -> NDArray[np.float32]:
+def light_from_sky(views: Views, cells: NDArray[np.float64], threads: int = 1) -> NDArray[np.float32]:
     """Light (S, 3, N) float32 of the sky past what stands, in the world's frame."""
     k = len(cells)
     out = np.zeros((len(views.distance), cells.size // k))
-    _add_open(views.distance, np.ascontiguousarray(cells.reshape(k, -1)), out)
+    flat = np.ascontiguousarray(cells.reshape(k, -1))
+    in_parts(lambda a, b: _add_open(views.distance[a:b], flat, out[a:b]), len(out), threads)
     return out.reshape(-1, *cells.shape[1:]).astype(np.float32)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _add_open(distance, cells, out):  # type: ignore[no-untyped-def]
     for s in range(len(distance)):
         for k in range(distance.shape[1]):
@@ -108,19 +127,21 @@ def _add_open(distance, cells, out):  # type: ignore[no-untyped-def]
 
 
 def light_from_surfaces(
-    views: Views, exits: NDArray[np.float32], order: int, covered: NDArray[np.bool_]
+    views: Views, exits: NDArray[np.float32], order: int, covered: NDArray[np.bool_], threads: int = 1
 ) -> NDArray[np.float32]:
     """Light (S, 3, N) float32 that the surfaces send whose exit radiance is exits (receivers, 3). Where some corners of
     a face are covered (receivers,), the others speak for it."""
-    directions = cube.texel_directions(CELLS).reshape(-1, 3)
-    weight = np.tile(cube.solid_angles(CELLS).reshape(-1), 6)
-    y = sh.harmonics(directions, order) * weight[:, None]
+    y = _weighed_harmonics(order)
     out = np.zeros((len(views.distance), 3, order * order))
-    _add_hits(views.receiver, views.share, exits, y, covered, out)
+
+    def part(a: int, b: int) -> None:
+        _add_hits(views.receiver[a:b], views.share[a:b], exits, y, covered, out[a:b])
+
+    in_parts(part, len(out), threads)
     return out.astype(np.float32)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _add_hits(receiver, share, exits, y, covered, out):  # type: ignore[no-untyped-def]
     for s in range(len(receiver)):
         for k in range(receiver.shape[1]):
@@ -151,9 +172,7 @@ def light_from_lobes(
 ) -> NDArray[np.float32]:
     """Light (S, 3, N) float32 of the surfaces' specular lobes, as `shade.bounces` sends it; of a face, that of the
     corner next to the hit. normals, material of the receivers."""
-    directions = cube.texel_directions(CELLS).reshape(-1, 3)
-    weight = np.tile(cube.solid_angles(CELLS).reshape(-1), 6)
-    y = sh.harmonics(directions, order) * weight[:, None]
+    directions, y = _directions(), _weighed_harmonics(order)
     out = np.zeros((len(views.distance), 3, order * order))
     _add_lobes(views.receiver, views.share, directions, light, normals, material, factors, y, covered, out)
     return out.astype(np.float32)
@@ -186,36 +205,43 @@ def _add_lobes(  # type: ignore[no-untyped-def]
 
 
 def unhidden(
-    views: Views, sites: NDArray[np.float64], center: NDArray[np.float64], radius: float
+    views: Views, sites: NDArray[np.float64], centers: NDArray[np.float64], radii: NDArray[np.float64], threads: int = 1
 ) -> NDArray[np.float32]:
-    """Share (S,) of a ball that nothing standing hides from the sites: of the cells in its cone, which is taken as wide
-    as a cell at least, those that nothing blocks before the ball's middle."""
-    solid = np.tile(cube.solid_angles(CELLS).reshape(-1), 6)
-    directions = cube.texel_directions(CELLS).reshape(-1, 3)
-    out = np.ones(len(sites), np.float32)
-    _unhidden(views.distance, directions, solid, np.ascontiguousarray(sites), center, radius, out)
+    """Share (S, E) of balls, centers (E, 3), radii (E,), that nothing standing hides from the sites: of the cells in a
+    ball's cone, which is taken as wide as a cell at least, those that nothing blocks before the ball's middle."""
+    out = np.ones((len(sites), len(centers)), np.float32)
+    p = np.ascontiguousarray(sites)
+
+    def part(a: int, b: int) -> None:
+        _unhidden(views.distance[a:b], _directions(), _solid_angles(), p[a:b], centers, radii, out[a:b])
+
+    in_parts(part, len(sites), threads)
     return out
 
 
-@njit(cache=True)
-def _unhidden(distance, directions, solid, sites, center, radius, out):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True)
+def _unhidden(distance, directions, solid, sites, centers, radii, out):  # type: ignore[no-untyped-def]
     narrow = 1.0 / math.sqrt(1.0 + 2.0 / (CELLS * CELLS))  # a cone of a larger cosine may have no cell's centre in it
     for s in range(len(sites)):
-        x, y, z = center[0] - sites[s, 0], center[1] - sites[s, 1], center[2] - sites[s, 2]
-        far2 = x * x + y * y + z * z
-        if far2 <= radius * radius:
-            continue
-        least = math.sqrt(far2) * min(math.sqrt(1.0 - radius * radius / far2), narrow)
-        total = hidden = 0.0
+        nearest = np.inf
         for k in range(len(directions)):
-            # Distance of the middle of the ball's chord along the cell's direction.
-            middle = directions[k, 0] * x + directions[k, 1] * y + directions[k, 2] * z
-            if middle >= least:
-                total += solid[k]
-                if distance[s, k] < middle:
-                    hidden += solid[k]
-        if total > 0.0:
-            out[s] = 1.0 - hidden / total
+            nearest = min(nearest, distance[s, k])
+        for e in range(len(centers)):
+            x, y, z = centers[e, 0] - sites[s, 0], centers[e, 1] - sites[s, 1], centers[e, 2] - sites[s, 2]
+            far2 = x * x + y * y + z * z
+            if far2 <= radii[e] * radii[e] or nearest * nearest >= far2:
+                continue
+            least = math.sqrt(far2) * min(math.sqrt(1.0 - radii[e] * radii[e] / far2), narrow)
+            total = hidden = 0.0
+            for k in range(len(directions)):
+                # Distance of the middle of the ball's chord along the cell's direction.
+                middle = directions[k, 0] * x + directions[k, 1] * y + directions[k, 2] * z
+                if middle >= least:
+                    total += solid[k]
+                    if distance[s, k] < middle:
+                        hidden += solid[k]
+            if total > 0.0:
+                out[s, e] = 1.0 - hidden / total
 
 
 class Between(NamedTuple):
@@ -226,11 +252,19 @@ class Between(NamedTuple):
 
     def blend(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Values (S, ...) float32 at the points, (n, ...)."""
-        flat = values.reshape(len(values), -1)
+        flat = np.ascontiguousarray(values.reshape(len(values), -1))
         out = np.zeros((len(self.site), flat.shape[1]), np.float32)
-        for k in range(self.site.shape[1]):
-            out += self.weight[:, k, None] * flat[self.site[:, k]]
+        _blend(self.site, self.weight, flat, out)
         return out.reshape(-1, *values.shape[1:])
+
+
+@njit(cache=True, nogil=True)
+def _blend(site, weight, values, out):  # type: ignore[no-untyped-def]
+    for i in range(len(site)):
+        for k in range(site.shape[1]):
+            w, own = weight[i, k], values[site[i, k]]
+            for j in range(len(own)):
+                out[i, j] += w * own[j]
 
 
 def between(points: NDArray[np.float64], sites: NDArray[np.float64]) -> Between:

@@ -83,14 +83,14 @@ def test_a_wall_hides_what_is_behind_it(x, wanted):
     sites = np.zeros((1, 3))
     views = views_of(wall(x), sites)
     for radius in (0.01, 0.5):
-        assert unhidden(views, sites, np.array([3.0, 0.0, 0.0]), radius)[0] == wanted
+        assert unhidden(views, sites, np.array([[3.0, 0.0, 0.0]]), np.array([radius]))[0, 0] == wanted
 
 
 def test_half_a_wall_hides_half():
     half = trimesh.Trimesh([[1, 0, -50], [1, 50, -50], [1, 50, 50], [1, 0, 50]], [[0, 1, 2], [0, 2, 3]])
     sites = np.zeros((1, 3))
-    found = unhidden(views_of(half, sites), sites, np.array([3.0, 0.0, 0.0]), 1.5)
-    assert found[0] == pytest.approx(0.5, abs=0.01)
+    found = unhidden(views_of(half, sites), sites, np.array([[3.0, 0.0, 0.0]]), np.array([1.5]))
+    assert found[0, 0] == pytest.approx(0.5, abs=0.01)
 
 
 def test_points_take_the_nearest_sites():
@@ -168,11 +168,12 @@ def test_points_close_to_a_ball_see_its_solid_angle():
     rows = open_rows([entity], lookup, ORDER)
     close = look_close(entity, 0, body, Tracer(positions, faces), points, lookup)
     np.testing.assert_array_equal(close.target, [0, 2])
-    now, more, where = add_samples(lookup, rows, close, 0, entity.turn(ORDER))
+    before = lookup.weight[1].copy()
+    more, (where,) = add_samples(lookup, rows, [close], [entity.turn(ORDER)])
     wanted = 2 * np.pi * (1 - np.sqrt(1 - 1 / 1.01**2))
-    assert (EVEN - more[now.place[0, 0, 0], 0, 0]) * EVEN == pytest.approx(wanted, rel=0.03)  # 512 rays of a lattice
+    assert (EVEN - more[lookup.place[0, 0, 0], 0, 0]) * EVEN == pytest.approx(wanted, rel=0.03)  # 512 rays of a lattice
     assert where.stop - where.start == 2
-    np.testing.assert_array_equal(now.weight[1], lookup.weight[1])
+    np.testing.assert_array_equal(lookup.weight[1], before)
     up = np.tile(np.float32([0, 1, 0]), (2, 1))
     np.testing.assert_array_equal(covered(close, up, entity.rotation), [True, True])
     np.testing.assert_array_equal(covered(close, -up, entity.rotation), [False, False])
