@@ -19,6 +19,7 @@ from relightcli import __version__
 from relightcli.adapters.gltf import buffer_files
 from relightcli.adapters.rays import Tracer
 from relightcli.core.fields.adaptive import adaptive_radii, least_resolution
+from relightcli.core.fields.albedos import NODES
 from relightcli.core.fields.body import Body, make_body
 from relightcli.core.fields.build import RAYS, field_samples
 from relightcli.core.fields.field import shell_radii
@@ -98,11 +99,13 @@ class FieldSettings:
 
 @dataclass(frozen=True)
 class Mover:
-    """One rigid object: its mesh in its own frame, the body, and the number of its field."""
+    """One rigid object: its mesh in its own frame, the body, the number of its field, and whether that holds for any
+    albedo (`core.fields.albedos`)."""
 
     mesh: OwnMesh
     body: Body
     field: int
+    any_albedo: bool
 
 
 @dataclass(frozen=True)
@@ -143,6 +146,9 @@ def find_movers(scene: Scene, settings: FieldSettings, cut: bool, seed: int) -> 
         mesh = own_mesh(scene, name, cut)
         texture = vertex_colours(mesh.geometry)
         own = mesh.geometry
+        any_albedo = material.adjustable and material.model == "lambert" and bool((texture == texture[:, :1]).all())
+        if any_albedo:
+            material = replace(material, diffuse=NODES)
         body = make_body(own.positions, own.normals, own.faces, spec.two_sided, texture, material, settings.order)
         files = [spec.mesh, *buffer_files(spec.mesh)]
         if material.diffuse_texture is not None:
@@ -180,7 +186,7 @@ def find_movers(scene: Scene, settings: FieldSettings, cut: bool, seed: int) -> 
                 seed,
             )
             fields.append(Distinct(field, body, texture, radii, proxies, made, inputs))
-        movers.append(Mover(mesh, body, known[key]))
+        movers.append(Mover(mesh, body, known[key], any_albedo))
     return Moving(tuple(movers), tuple(fields))
 
 
@@ -237,8 +243,8 @@ def add_points(
 def describe(moving: Moving, scene: Scene, starts: tuple[int, ...]) -> dict[str, Any]:
     """The attribute `fields` of the store.
 
-    objects: name to the number of its field, its first receiver and their number, and its placement (4, 4), own frame
-    to world; lights: name to the number of its source field, under `sources/`.
+    objects: name to the number of its field, its first receiver and their number, its placement (4, 4), own frame to
+    world, and whether the field holds for any albedo; lights: name to the number of its source field, under `sources/`.
     """
     objects = {
         mover.mesh.name: {
@@ -246,6 +252,7 @@ def describe(moving: Moving, scene: Scene, starts: tuple[int, ...]) -> dict[str,
             "first": starts[1 + i],
             "count": len(mover.body.point),
             "placement": mover.mesh.placement.tolist(),
+            "any_albedo": mover.any_albedo,
         }
         for i, mover in enumerate(moving.movers)
     }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 import relight_formats as formats
 from relightcli.adapters.rays import Tracer
 from relightcli.core.brdf.models import SPECULAR, pack_materials
+from relightcli.core.fields.albedos import self_weights, transfer_at
 from relightcli.core.fields.body import Body, axes, make_body
 from relightcli.core.fields.entities import Entity, Surroundings, of_light
 from relightcli.core.fields.interpolate import make_grid
@@ -32,12 +33,15 @@ SIMILAR = 1e-6  # relative, by which a placement may differ from a rotation and 
 @dataclass(frozen=True)
 class Mover:
     """One object that may be moved. rows: its receivers; placement (4, 4): from its field's frame to where the scene
-    has it; sites (S, 3) on it in the field's frame, after its proxies; spread: how its points take light from those."""
+    has it; kept: the field, if it holds for any albedo; made_for: the material of `own` and `receivers`; sites (S, 3)
+    on it in the field's frame, after its proxies; spread: how its points take light from those."""
 
     name: str
     rows: slice
     placement: F64
     material: str
+    kept: KeptField | None
+    made_for: Material
     body: Body
     own: Surroundings
     tracer: Tracer
@@ -49,6 +53,20 @@ class Mover:
     @property
     def proxies(self) -> int:
         return 0 if self.own.proxies is None else len(self.own.proxies)
+
+    def dyed(self, material: Material) -> Mover:
+        """With another diffuse colour. Raises InputError for what its field does not hold for."""
+        if material == self.made_for:
+            return self
+        if self.kept is None or replace(material, diffuse=self.made_for.diffuse) != self.made_for:
+            raise InputError(
+                f"--set {self.material}: is the material of {self.name!r}, which moves: of its fields, only the "
+                "diffuse colour of an adjustable lambert material without a coloured texture can be changed. Change "
+                "the scene file and precompute again, or add --reference."
+            )
+        own = replace(self.own, transfer=transfer_at(self.kept.transfer, material.diffuse))
+        receivers = _receivers(self.body, self.kept, material, any_albedo=True)
+        return replace(self, made_for=material, own=own, receivers=receivers)
 
     def at(self, matrix: F64) -> Entity:
         """The object placed by (4, 4), a rotation times a positive number and a translation."""
@@ -71,11 +89,11 @@ def similarity(name: str, matrix: F64) -> tuple[F64, F64, float]:
 def read_movers(store: formats.Store, scene_materials: dict[str, Material], objects: dict[str, Any]) -> list[Mover]:
     """Everything that the store has fields of; objects: the scene's, by name."""
     order = int(store.settings["fields"]["order"])
-    parts: dict[tuple[int, str, bool], tuple[Any, ...]] = {}
+    parts: dict[tuple[int, str, bool, bool], tuple[Any, ...]] = {}
     movers = []
     for name, about in store.attrs["fields"]["objects"].items():
         spec = objects[name]
-        key = int(about["field"]), str(spec.material), bool(spec.two_sided)
+        key = int(about["field"]), str(spec.material), bool(spec.two_sided), bool(about["any_albedo"])
         if key not in parts:
             parts[key] = _read_object(store, key, scene_materials[spec.material], order)
         rows = slice(int(about["first"]), int(about["first"]) + int(about["count"]))
@@ -83,14 +101,17 @@ def read_movers(store: formats.Store, scene_materials: dict[str, Material], obje
     return movers
 
 
-def _read_object(store: formats.Store, key: tuple[int, str, bool], material: Material, order: int) -> tuple[Any, ...]:
+def _read_object(
+    store: formats.Store, key: tuple[int, str, bool, bool], material: Material, order: int
+) -> tuple[Any, ...]:
+    """The parts of a mover from `kept` on."""
     prefix = f"fields/{key[0]}/"
     read: Any = store.read
     position, face = read(f"{prefix}mesh/position"), read(f"{prefix}mesh/face")
     body = make_body(
         position, read(f"{prefix}mesh/normal"), face, key[2], read(f"{prefix}mesh/texture"), material, order
     )
-    kept = read_field(store, prefix)
+    kept, any_albedo = read_field(store, prefix), key[3]
     used = position[np.unique(face)]
     own = Surroundings(
         make_grid(kept.radii, kept.resolution, kept.valid),
@@ -98,7 +119,7 @@ def _read_object(store: formats.Store, key: tuple[int, str, bool], material: Mat
         np.stack([used.min(axis=0), used.max(axis=0)]),
         body.radius,
         kept.occlusion,
-        kept.transfer,
+        transfer_at(kept.transfer, material.diffuse) if any_albedo else kept.transfer,
         None,
         kept.proxies,
     )
@@ -107,19 +128,24 @@ def _read_object(store: formats.Store, key: tuple[int, str, bool], material: Mat
     on_surface = body.point[chosen]
     sites = np.concatenate([kept.proxies, on_surface + INWARDS * (body.center - on_surface)])
     return (
+        kept if any_albedo else None,
+        material,
         body,
         own,
         Tracer(body.positions, body.faces),
-        _receivers(body, kept, material),
+        _receivers(body, kept, material, any_albedo),
         colour,
         sites,
         between(body.point, on_surface),
     )
 
 
-def _receivers(body: Body, kept: KeptField, material: Material) -> Receivers:
+def _receivers(body: Body, kept: KeptField, material: Material, any_albedo: bool) -> Receivers:
     """What the points make of light; their texture acts in the picture."""
-    to_diffuse = kept.self_diffuse * np.array(material.diffuse, np.float32)
+    of_white = kept.self_diffuse
+    if any_albedo:
+        of_white = of_white @ self_weights(material.diffuse).astype(np.float32)
+    to_diffuse = of_white * np.array(material.diffuse, np.float32)
     to_frame = np.zeros((0, body.order**2, body.order**2, 1), np.float32)
     if kept.self_whole is not None:
         to_frame = np.empty_like(kept.self_whole)

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -47,7 +48,7 @@ class CompressedTransfer:
 
     shape m, N, N, C of a sample; cluster (samples,) uint8
     start (K + 1,) int32: components of cluster h are start[h] to start[h + 1], the mean first
-    component (E, m N N C) int16, to be multiplied by scale (E,) float32
+    component (E, m N N C) int16, or float32 (see `albedos`), to be multiplied by scale (E,) float32
     coefficient (A,) int16, to be multiplied by coefficient_scale (E,) float32 of its component: those of a sample, all
     but the mean's, lie together; first (samples + 1,) int64: where
     error: |M - M~| / |M|, Frobenius, over all samples, rounding included
@@ -56,7 +57,7 @@ class CompressedTransfer:
     shape: tuple[int, int, int, int]
     cluster: NDArray[np.uint8]
     start: NDArray[np.int32]
-    component: NDArray[np.int16]
+    component: NDArray[Any]
     scale: NDArray[np.float32]
     coefficient: NDArray[np.int16]
     coefficient_scale: NDArray[np.float32]
