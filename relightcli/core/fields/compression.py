@@ -121,7 +121,9 @@ def compress(
     if not np.isfinite(norm2):
         raise NumericalError("compression of a transfer field: values that are not finite")
     goal2 = None if tolerance is None else max(tolerance, _FLOOR) ** 2 * norm2
-    basis, x, left2 = _common_basis(rows, mean, _FLOOR**2 * norm2 if goal2 is None else goal2, seed)
+    # By terms, the common basis is as it is, and what it leaves counts as theirs.
+    enough, most = (_FLOOR**2 * norm2, np.inf) if goal2 is None else (_ENOUGH * goal2, _OF_BASIS * goal2)
+    basis, x, left2 = _common_basis(rows, mean, enough, most, seed)
     label = cpca(x[:, :MOST_TOLD_APART], clusters, max(1, terms - 1), seed).label
     spaces = [_subspace(x[label == h]) for h in range(int(label.max()) + 1)]
     sizes = np.bincount(label)
@@ -206,10 +208,10 @@ def _subspace(own: NDArray[np.float32]) -> _Subspace:
 
 
 def _common_basis(
-    rows: _Rows, mean: NDArray[np.float32], goal2: float, seed: int
+    rows: _Rows, mean: NDArray[np.float32], enough: float, most: float, seed: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float32], float]:
     """An orthonormal basis (D, R), the coordinates (n, R) in it of the rows less their mean, and the square sum that it
-    leaves: at most a share of `goal2`.
+    leaves: as small as a basis that leaves `enough`, or COMMON, or as large as one that leaves at most `most`.
 
     By a random sketch of the rows with one power step: a Gram matrix of D = 6,000 would cost ten times as much.
     """
@@ -233,10 +235,10 @@ def _common_basis(
                 start += len(own)
         spectrum, vectors = gram_spectrum(gram)
         left = np.maximum(total - np.cumsum(spectrum), 0.0)
-        if left[-1] <= _OF_BASIS * goal2 or size == min(rows.width, count):
+        if left[-1] <= most or size == min(rows.width, count):
             break
         size = min(2 * size, rows.width, count)
-    keep = vectors[:, : int((left > _ENOUGH * goal2).sum()) + 1]
+    keep = vectors[:, : int((left > enough).sum()) + 1]
     return basis @ keep, coordinates @ keep.astype(np.float32), float(left[keep.shape[1] - 1])
 
 
