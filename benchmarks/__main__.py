@@ -33,6 +33,7 @@ NAMES = (
     "pose",
     "fields",
     "field_stores",
+    "moving",
 )
 PACKAGES = ("relightcli", "numpy", "numba", "zarr", "embreex", "mitsuba", "pyradiance")
 RESULTS = Path("build/bench.json")

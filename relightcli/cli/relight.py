@@ -63,6 +63,13 @@ from relightcli.cli import options
 @click.option("--reference", is_flag=True, help="Path-trace instead; STORE may also be a scene file.")
 @click.option("--spp", default=256, type=click.IntRange(1, 1 << 20), show_default=True, help="Samples of --reference.")
 @click.option("--bounces", default=None, type=click.IntRange(0, 64), help="Interreflections. Default: the store's.")
+@click.option(
+    "--suns",
+    type=click.Choice(["soft", "traced"]),
+    default="soft",
+    show_default=True,
+    help="Shadows of what moves in the light of small bright places of the sky: by fields, or by rays.",
+)
 @click.option("--seed", default=0, type=options.SEED, help="Seed of --reference.")
 @click.option("--allow-outside", is_flag=True, help="Let a scene file use files outside its folder.")
 @click.option("--dry-run", is_flag=True, help="Say what would be written; do nothing.")
@@ -91,7 +98,17 @@ def command(
     if as_json and config.output == "-":
         raise click.UsageError("--json and -o - both want stdout")
     result = relight(config)
-    options.tell(result, _text(result), as_json, quiet)
+    options.tell(result, "\n".join([_text(result), *(_steps(result) if verbose else [])]), as_json, quiet)
+
+
+def _steps(result: dict[str, Any]) -> list[str]:
+    """What light of moved things took, step by step."""
+    if "moving" not in result:
+        return []
+    moving = result["moving"]
+    lines = [f"  {name}: {1e3 * seconds:.1f} ms a picture" for name, seconds in moving["seconds"].items()]
+    hits = f"  {moving['samples']} samples of fields made, {100 * moving['sample_hits']:.1f} % of reads found one made"
+    return [*lines, hits, f"  {moving['sun_rays']} rays to suns in the last picture"]
 
 
 def _text(result: dict[str, Any]) -> str:

@@ -133,7 +133,7 @@ class LightingStore:
         self._gathered: dict[int, Gather] = {}
         self._seen: list[tuple[int, Gather]] | None = None
         self._coated: tuple[dict[str, Material], _Coats] | None = None
-        self._cubes: tuple[tuple[object, ...], SkyCube] | None = None
+        self._cubes: list[tuple[NDArray[np.float32], int, float, SkyCube]] = []
         self._bits: Future[NDArray[np.uint8]] | None = None
         if "visibility/bits" in self.store:
             layout = self.store.layouts["visibility/bits"]
@@ -178,6 +178,16 @@ class LightingStore:
                 'precompute objects with motion = "rigid" and their fields'
             )
         return []
+
+    def trace_suns(self) -> None:
+        """Shadows that movers throw in the light of suns become sharp. Raises InputError where nothing moves."""
+        raise InputError(
+            f"--suns traced: {self.store.path} holds nothing that may be moved: its shadows are as sharp as they get"
+        )
+
+    def costs(self) -> dict[str, Any]:
+        """What the pictures so far took, by step; empty where there are no steps."""
+        return {}
 
     def put_light(self, writer: formats.Writer) -> None:
         """Writes what a later `resume` needs, if anything."""
@@ -292,11 +302,13 @@ class LightingStore:
         return Radiance(diffuse, specular)
 
     def _cube(self, environment: NDArray[np.float32], resolution: int, rotate: float) -> SkyCube:
-        """The map as a cube, kept while the same array is asked for."""
-        key = (environment, resolution, rotate)
-        if self._cubes is None or self._cubes[0][0] is not environment or self._cubes[0][1:] != key[1:]:
-            self._cubes = key, latlong_to_cube(environment, resolution, rotate)
-        return self._cubes[1]
+        """The map as a cube; those of the last two arrays are kept."""
+        for known, size, turn, sky in self._cubes:
+            if known is environment and (size, turn) == (resolution, rotate):
+                return sky
+        made = latlong_to_cube(environment, resolution, rotate)
+        self._cubes = [*self._cubes[-1:], (environment, resolution, rotate, made)]
+        return made
 
     def _exact_specular(
         self,

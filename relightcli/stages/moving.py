@@ -8,6 +8,9 @@ it.
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +36,7 @@ from relightcli.core.fields.standing import (
     light_from_surfaces,
     sky_cells,
 )
+from relightcli.core.fields.suns import sun_light
 from relightcli.core.lights.environment import SkyCube, splat
 from relightcli.core.shade.bounces import Exit
 from relightcli.core.shade.gather import Gather
@@ -47,9 +51,11 @@ from relightcli.scene.moving import apply_moves, inverse_affine, move_geometry
 from relightcli.stages.lighting import LightingStore, Radiance, _Coats
 from relightcli.stages.placed import Mover, light_entity, read_lights, read_movers
 from relightcli.stages.placement import Placement, Sites, ball, place
+from relightcli.stages.suns import Suns
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+STEPS = ("views", "look_up", "reflections", "light", "suns", "all")
 SLAB = 8192  # receivers whose sky terms are made at a time
 
 
@@ -86,7 +92,12 @@ class MovingStore(LightingStore):
         # Without a mesh that is seen from pixels there is a receiver for every vertex that anything can see.
         self._sides = self.receiver_of_vertex()
         self._sites = Sites(self.movers)
-        self._sky: tuple[NDArray[np.float64], F32, NDArray[np.float64]] | None = None
+        self._terms: tuple[F64, F32] | None = None
+        self._cells: list[tuple[F64, F64]] = []
+        self._suns: Suns | None = None
+        self._sunlight: Radiance | None = None
+        self._pictures = 0
+        self._seconds: dict[str, float] = dict.fromkeys(STEPS, 0.0)
         self._bits_of_lights: dict[tuple[object, ...], NDArray[np.uint8]] = {}
         self._passed: _Passed | None = None
         self._cosines: F32 | None = None  # of the standing receivers
@@ -130,6 +141,32 @@ class MovingStore(LightingStore):
             return mover.placement
         return transform @ inverse_affine(stored) @ mover.placement
 
+    def costs(self) -> dict[str, Any]:
+        """Mean seconds a picture by step; of the last picture, samples that were made, the share of all reads that
+        found theirs made, and rays to suns."""
+        if self._placed is None:
+            return {}
+        made = len(self._placed.rows)
+        reads = int(np.count_nonzero(self._placed.lookup.weight))
+        return {
+            "seconds": {name: seconds / max(self._pictures, 1) for name, seconds in self._seconds.items()},
+            "samples": made,
+            "sample_hits": 1.0 - made / max(reads, made),
+            "sun_rays": 0 if self._suns is None else self._suns.rays,
+        }
+
+    @contextmanager
+    def _step(self, name: str) -> Iterator[None]:
+        started = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._seconds[name] += time.perf_counter() - started
+
+    def trace_suns(self) -> None:
+        """See `LightingStore.trace_suns`."""
+        self._suns = Suns(self._still, self.position[: self.static], self.normal[: self.static])
+
     def exit_radiance(
         self,
         environment: NDArray[np.float32],
@@ -145,9 +182,14 @@ class MovingStore(LightingStore):
             self.movers[e] = mover.dyed(materials[mover.material])
             if self._placed is not None:
                 self._placed.entities[e] = replace(self._placed.entities[e], own=self.movers[e].own)
+        started = time.perf_counter()
         parts = super().exit_radiance(environment, rotate, materials, view, active, basis, bounces)
         if not self.apart:
+            for part in parts[1:]:
+                part.diffuse[self.static :] = 0.0  # of points that others see: they were needed on the way
             self._light_together(parts[0], view)
+        self._pictures += 1
+        self._seconds["all"] += time.perf_counter() - started
         return parts
 
     def buried(self) -> NDArray[np.bool_]:
@@ -160,28 +202,30 @@ class MovingStore(LightingStore):
         if self._placed is None:
             entities = [m.at(self._matrix(m, self._now.objects[m.name].transform)) for m in self.movers]
             lights = [light_entity(self._sources[k], self.scene.lights[k], v) for k, v in self._now.lights.items()]
-            seen = self._sites.look(entities, self._still, self._rest[0].positions, self._faces, self._sides)
-            self._placed = place(
-                self.movers,
-                lights,
-                entities,
-                self.position,
-                self.normal,
-                super().buried(),
-                self.static,
-                seen[0],
-                self._sites,
-                seen[1],
-                self.order,
-                self.threads,
-            )
+            with self._step("views"):
+                seen = self._sites.look(entities, self._still, self._rest[0].positions, self._faces, self._sides)
+            with self._step("look_up"):
+                self._placed = place(
+                    self.movers,
+                    lights,
+                    entities,
+                    self.position,
+                    self.normal,
+                    super().buried(),
+                    self.static,
+                    seen[0],
+                    self._sites,
+                    seen[1],
+                    self.order,
+                    self.threads,
+                )
         return self._placed
 
     # -- light of the sky and the local lights
 
-    def _sky_terms(self, sky: SkyCube) -> tuple[F32, NDArray[np.float64]]:
-        """W of the standing receivers (`core.fields.dimmed`), and the cells that sites see the sky through."""
-        if self._sky is None or not np.array_equal(self._sky[0], sky.flux):
+    def _sky_terms(self, sky: SkyCube) -> F32:
+        """W of the standing receivers (`core.fields.dimmed`)."""
+        if self._terms is None or not np.array_equal(self._terms[0], sky.flux):
             basis = sky_basis(splat(sky), self.order)
             terms = np.empty((self.static, 3, self.order**2), np.float32)
             for block, bits in self.blocks(0, self.static):
@@ -189,8 +233,17 @@ class MovingStore(LightingStore):
                     part = slice(a, min(a + SLAB, block.stop))
                     seen = bits[a - block.start : part.stop - block.start]
                     terms[part] = sky_terms(seen, self.normal[part], basis)
-            self._sky = sky.flux, terms, sky_cells(sky, self.order)
-        return self._sky[1:]
+            self._terms = sky.flux, terms
+        return self._terms[1]
+
+    def _sky_cells(self, sky: SkyCube) -> F64:
+        """The cells that sites see the sky through; those of the last two skies are kept."""
+        for flux, cells in self._cells:
+            if np.array_equal(flux, sky.flux):
+                return cells
+        made = sky_cells(sky, self.order)
+        self._cells = [*self._cells[-1:], (sky.flux, made)]
+        return made
 
     def _irradiance(self, sky: SkyCube, active: NDArray[np.bool_] | None, basis: str) -> NDArray[np.float32]:
         still = np.zeros(len(self), bool)
@@ -201,7 +254,7 @@ class MovingStore(LightingStore):
         if self._whole is None or not _same(self._whole[:3], (sky.flux, still, basis)):
             self._whole = sky.flux, still, basis, super()._irradiance(sky, still, basis)[: self.static]
         whole = self._whole[3]
-        terms, _ = self._sky_terms(sky)
+        terms = self._sky_terms(sky)
         hidden = -self._where().passed
         hidden[:, 0] += EVEN
         lost = (terms * hidden[:, None, :]).sum(axis=2)
@@ -218,16 +271,49 @@ class MovingStore(LightingStore):
         active: NDArray[np.bool_] | None,
         basis: str,
     ) -> Radiance:
-        found = super()._direct(environment, rotate, coats, view, looked_at, active, basis)
-        sky = self._cube(environment, self.resolution, rotate)
-        _, cells = self._sky_terms(sky)
-        placed = self._where()
-        behind = light_from_sky(placed.views, cells, self.threads)
+        placed, suns = self._where(), self._suns
+        without = environment
+        if suns is not None:
+            suns.set_sky(environment, rotate)
+            without = suns.rest
+        found = super()._direct(without, rotate, coats, view, looked_at, active, basis)
+        behind = light_from_sky(
+            placed.views, self._sky_cells(self._cube(environment, self.resolution, rotate)), self.threads
+        )
+        rest = behind
+        if without is not environment:
+            rest = light_from_sky(
+                placed.views, self._sky_cells(self._cube(without, self.resolution, rotate)), self.threads
+            )
         count = placed.proxies.stop - placed.proxies.start
         nothing = np.zeros((count, 3, self.order**2), np.float32)
         self._passed = _Passed(nothing, nothing.copy(), np.zeros_like(behind), placed.rows.copy())
-        self._pass_on(placed, placed.rows, behind, view, found)
+        self._pass_on(placed, placed.rows, behind, rest, view, found)
+        self._sunlight = None
+        if suns is not None and len(suns.points.flux):
+            with self._step("suns"):
+                self._sunlight = self._light_of(suns, coats, view)
+            if self.apart:
+                self._add_sunlight(found, slice(None))
+            else:
+                self._add_sunlight(found, slice(0, self.static))
+                self._add_sunlight(found, placed.shown)
         return found
+
+    def _light_of(self, suns: Suns, coats: _Coats, view: NDArray[np.float32] | None) -> Radiance:
+        """Exit radiance of all receivers in the light of the suns."""
+        placed = self._where()
+        seen = suns.seen(self.movers, placed.entities, self.position, self.normal, self.threads)
+        e, s = sun_light(seen, suns.points, self.normal, view, coats.material, coats.table, self.threads)
+        colour = coats.table.parameters[coats.material][:, SPECULAR : SPECULAR + 3].astype(np.float32)
+        return Radiance(coats.diffuse(e), np.where(coats.shiny[:, None], s * colour, np.float32(0.0)))
+
+    def _add_sunlight(self, out: Radiance, rows: slice | NDArray[np.int64]) -> None:
+        if self._sunlight is None:
+            return
+        out.diffuse[rows] += self._sunlight.diffuse[rows]
+        if out.specular is not None and self._sunlight.specular is not None:
+            out.specular[rows] += self._sunlight.specular[rows]
 
     def _at(
         self,
@@ -238,38 +324,48 @@ class MovingStore(LightingStore):
         spread: Between | None = None,
     ) -> F32:
         """Light at targets. See `chain.light_at`."""
-        return light_at(
-            placed.lookup.points(targets),
-            rows,
-            far,
-            self.threads,
-            placed.share_of(targets),
-            spread,
-            1.0 / self.order**2,
-            np.arange(len(placed.entities)) >= len(self.movers),
-        )
+        with self._step("light"):
+            return light_at(
+                placed.lookup.points(targets),
+                rows,
+                far,
+                self.threads,
+                placed.share_of(targets),
+                spread,
+                1.0 / self.order**2,
+                np.arange(len(placed.entities)) >= len(self.movers),
+            )
 
     def _pass_on(
-        self, placed: Placement, rows: F32, behind: F32, view: NDArray[np.float32] | None, out: Radiance
+        self,
+        placed: Placement,
+        rows: F32,
+        behind: F32,
+        rest: F32,
+        view: NDArray[np.float32] | None,
+        out: Radiance,
     ) -> None:
         """Light at the proxies, of rows and, from behind all, at the sites; and exit radiance of the movers into out:
-        of all points where reflections are wanted apart, else of those that close points see."""
+        of all points where reflections are wanted apart, else of those that close points see. rest: what the points
+        get from behind all, which may be less than what is reflected."""
         passed = self._passed
         assert passed is not None
         passed.at_proxies = self._at(placed, placed.proxies, rows, behind[self._sites.on_proxy])
-        passed.behind += behind
+        passed.behind += rest
         if self.apart:
-            self._light_points(placed, rows, behind, None, view, out)
+            self._light_points(placed, rows, rest, None, view, out)
         elif len(placed.shown):
-            self._light_points(placed, rows, behind, placed.shown, None, out)
+            self._light_points(placed, rows, rest, placed.shown, None, out)
 
     def _light_together(self, out: Radiance, view: NDArray[np.float32] | None) -> None:
         """Exit radiance of the movers' points, of all reflections, into out."""
         placed, passed = self._where(), self._passed
         assert passed is not None
         lights, late = self._lights(passed.reflected), ~placed.early
-        put_reflections(passed.rows, placed.entities, placed.lookup, lights, threads=self.threads, wanted=late)
+        with self._step("reflections"):
+            put_reflections(passed.rows, placed.entities, placed.lookup, lights, threads=self.threads, wanted=late)
         self._light_points(placed, passed.rows, passed.behind, None, view, out)
+        self._add_sunlight(out, slice(self.static, len(self)))
 
     def _light_points(
         self,
@@ -423,7 +519,8 @@ class MovingStore(LightingStore):
         wanted = None if self.apart else placed.early
         lights = self._lights(passed.at_proxies)
         passed.reflected += passed.at_proxies
-        put_reflections(rows, placed.entities, placed.lookup, lights, threads=self.threads, wanted=wanted)
+        with self._step("reflections"):
+            put_reflections(rows, placed.entities, placed.lookup, lights, threads=self.threads, wanted=wanted)
         for k, (close, where) in enumerate(zip(placed.close, placed.where, strict=True)):
             if not len(close.target):
                 continue
@@ -441,7 +538,7 @@ class MovingStore(LightingStore):
         if len(light.lobe):
             normals, material = self.normal, coats.material
             behind += light_from_lobes(placed.views, light, normals, material, factors, self.order, placed.covered)
-        self._pass_on(placed, rows, behind, view, Radiance(out, specular))
+        self._pass_on(placed, rows, behind, behind, view, Radiance(out, specular))
         return out
 
     def _lights(self, at_proxies: F32) -> list[F32]:

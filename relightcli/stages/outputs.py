@@ -46,6 +46,7 @@ class Config:
     reference: bool = False
     spp: int = 256
     bounces: int | None = None
+    suns: str = "soft"
     seed: int = 0
     workers: int = 1
     overwrite: bool = False
@@ -70,6 +71,8 @@ def check(config: Config, suffix: str) -> None:
         raise InputError(f"--output {config.output}: a sequence needs #### in the name for the frame number")
     if config.previous is not None and config.reference:
         raise InputError("--from: has nothing to give to --reference")
+    if config.suns == "traced" and config.reference:
+        raise InputError("--suns traced: --reference traces all light anyway")
     if config.layers and suffix != ".exr":
         raise InputError(f"--layers: expected an .exr output, which can hold layers; found {config.output}")
     if config.reference and suffix not in PICTURES:

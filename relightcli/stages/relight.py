@@ -46,6 +46,8 @@ def relight(config: Config) -> dict[str, Any]:
         return render_reference(config, shots, suffix, started)
     lighting = open_lighting(config.store, config.workers)
     check_shots(config, shots, lighting.scene)
+    if config.suns == "traced":
+        lighting.trace_suns()
     for shot in shots:
         if shot.poses:  # whether the store poses at all, before anything is written
             check_poses(config, shots, lighting.scene, lighting.geometry)
@@ -65,6 +67,7 @@ def relight(config: Config) -> dict[str, Any]:
         written.append(session.write(shot, suffix))
         clocks.append(time.perf_counter() - clock)
     session.finish()
+    costs = lighting.costs()
     return {
         "store": str(config.store),
         "output": written if config.frames else written[0],
@@ -75,6 +78,7 @@ def relight(config: Config) -> dict[str, Any]:
         "frame_seconds": clocks,
         "rates": session.rates(),
         **({} if lighting.changed is None else {"changed_clusters": lighting.changed}),
+        **({"moving": costs} if costs else {}),
         "notes": session.notes,
     }
 

@@ -227,6 +227,8 @@ class Session:
         }
         if shot.poses:
             metadata["relight:pose"] = " ".join(shot.poses)
+        if config.suns != "soft":
+            metadata["relight:suns"] = config.suns
         if shot.moves:
             metadata["relight:move"] = " ".join(shot.moves)
         return put_picture(config, shot, suffix, pixels, layers, metadata)
@@ -265,6 +267,7 @@ class Session:
                 "bounces": config.bounces,
                 "frames": None if config.frames is None else formats.fingerprint_file(config.frames),
                 **({"pose": list(config.poses)} if config.poses else {}),
+                **({} if config.suns == "soft" else {"suns": config.suns}),
                 **({"move": list(config.moves)} if config.moves else {}),
             },
             inputs={"store": store.fingerprint, **self._maps, **previous},
