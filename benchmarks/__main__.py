@@ -35,6 +35,7 @@ NAMES = (
     "pose",
     "fields",
     "promise",
+    "field_stores",
     "moving",
 )
 PACKAGES = ("relightcli", "numpy", "numba", "zarr", "embreex", "mitsuba", "pyradiance")

@@ -65,12 +65,13 @@ def check_name(name: str) -> None:
 
 @dataclass(frozen=True)
 class Layout:
-    """Shape and chunking of one array, taken from its checked metadata."""
+    """Shape, chunking and packing (`lz4`, `zstd`, `none`) of one array, taken from its checked metadata."""
 
     shape: tuple[int, ...]
     chunks: tuple[int, ...]
     data_type: str
     dims: tuple[str, ...]
+    codec: str
 
     @property
     def raw_bytes(self) -> int:
@@ -198,8 +199,8 @@ def read_layout(document: dict[str, Any], where: str) -> Layout:
     )
     encoding = {"name": "default", "configuration": {"separator": "."}}
     need(document.get("chunk_key_encoding") == encoding, "chunk_key_encoding", "'default' with separator '.'")
-    allowed = [_codecs(dtype, codec) for codec in ("lz4", "zstd", "none")]
-    need(document.get("codecs") in allowed, "codecs", "bytes, then nothing, blosc lz4 or zstd, then crc32c")
+    allowed = {codec: _codecs(dtype, codec) for codec in ("lz4", "zstd", "none")}
+    need(document.get("codecs") in allowed.values(), "codecs", "bytes, then nothing, blosc lz4 or zstd, then crc32c")
     need(_fills(document.get("fill_value"), dtype), "fill_value", f"a value of {dtype}")
     need(document.get("storage_transformers", []) == [], "storage_transformers", "none")
     attributes = document.get("attributes")
@@ -208,7 +209,8 @@ def read_layout(document: dict[str, Any], where: str) -> Layout:
         "attributes",
         "an object with 'units'",
     )
-    return Layout(tuple(shape), tuple(chunks), dtype, tuple(dims))
+    codec = next(codec for codec, chain in allowed.items() if chain == document["codecs"])
+    return Layout(tuple(shape), tuple(chunks), dtype, tuple(dims), codec)
 
 
 def _fills(value: Any, dtype: str) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 
 from relight_formats.arrays import CHUNK_BYTES, Codec, Layout, array_metadata, check_name, read_layout
 from relight_formats.errors import StoreError
-from relight_formats.files import fsync_folder, local_path, sweep_unfinished, walk, write_durably
+from relight_formats.files import fsync_folder, local_path, remove_store, sweep_unfinished, walk, write_durably
 from relight_formats.fingerprint import fingerprint_bytes, plain
 from relight_formats.header import KEY, ROOT, dump, load_document, write_root
 from relight_formats.ledger import DOCUMENTS, FILE_NAME, LedgerFile, read_ledger
@@ -209,6 +209,23 @@ class Writer:
         )
         if values.size:
             array[...] = values
+
+    def drop(self, name: str) -> None:
+        """Delete an array, or a group and all in it, that only the work needed. Harmless if it is not there.
+
+        Raises:
+            ValueError: a name that the format does not allow.
+            OSError: no permission.
+        """
+        self._need_open()
+        check_name(name)
+        for own in [other for other in self._layouts if f"{other}/".startswith(f"{name}/")]:
+            del self._layouts[own]
+            self._synced.pop(own, None)
+        folder = self.partial_path / name
+        if folder.exists():
+            remove_store(folder)
+            fsync_folder(folder.parent)
 
     def set_attrs(self, attrs: dict[str, Any]) -> None:
         """Add JSON attributes to the root, replacing those of the same names. `relight` is reserved.

@@ -61,6 +61,12 @@ def _text(result: dict[str, Any]) -> str:
     for model in result.get("models", []):
         kind = f"{model['lobes']} lobes" if model["lobes"] else model["model"]
         lines.append(f"  model     visibility of {model['object']} by {kind}")
+    for field in result.get("fields", []):
+        names = ", ".join(field["objects"]) or "an object"
+        lines.append(
+            f"  field     of {names}: {size(field['bytes'])}; transfer {field['error']:.2%} off, "
+            f"{field['transfer_raw_bytes'] / field['transfer_bytes']:.0f} to 1"
+        )
     for name, array in result["arrays"].items():
         shape = " x ".join(str(n) for n in array["shape"])
         lines.append(f"  array     {name:24} {array['dtype']:8} {shape:24} {size(array['bytes'])}")

@@ -91,6 +91,12 @@ from relightcli.cli import options
     help="Spheres from 1.02 to 8 radii in equal ratios, from 0.1 to 8 in equal steps, or where the field bends.",
 )
 @click.option(
+    "--field-tolerance",
+    default=None,
+    type=float,
+    help="Relative error of the compressed transfer. Default: 0.01, and 0.02 for objects with a specular lobe.",
+)
+@click.option(
     "--field-library",
     default=None,
     type=options.PATH,

@@ -73,10 +73,12 @@ def run_blocks(
     label: str,
     quiet: bool = False,
     scheduler: str | None = None,
+    apart: bool = False,
 ) -> None:
     """Runs every block that the ledger does not hold yet. Raises what a block raised; what is done stays done.
 
     scheduler: address of a Dask scheduler, whose workers run the blocks instead of local processes.
+    apart: in worker processes always. There linear algebra has one thread, and the same bytes come out everywhere.
     """
     todo = [b for b in blocks if b.id not in ledger.done]
     total = len(todo) + len(ledger.done)
@@ -93,7 +95,7 @@ def run_blocks(
 
             run_on_cluster(scheduler, job, todo, finish, label)
             return
-        if workers <= 1 or len(todo) == 1:
+        if not apart and (workers <= 1 or len(todo) == 1):
             for block in todo:
                 finish(block, run_one(job, block))
             return
@@ -101,7 +103,7 @@ def run_blocks(
         while todo:
             before = len(todo)
             try:
-                with _pool(min(workers, len(todo))) as pool:
+                with _pool(max(1, min(workers, len(todo)))) as pool:
                     todo = _drain(pool, job, todo, finish)
             except BrokenProcessPool:
                 todo = [b for b in todo if b.id not in ledger.done]

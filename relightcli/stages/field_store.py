@@ -1,210 +1,165 @@
-"""Fields in a store: what arrays there are, the work on one block of them, and reading them again.
+"""Fields in a store: what arrays there are, putting them there, and reading them again.
 
 A field lies under a prefix: `fields/0/` in a transfer store, none in a store of its own (kind `field`):
 
-    mesh/position, normal, face, texture   the object in its own frame; its texture's mean colour around vertices
-    point, normal, vertex, side            the points that light is known at (`core.fields.body`)
-    radii, proxies                         see `core.fields.field.Field`
-    self                                   self transfer of the points
-    valid, occlusion, transfer             the samples
+    mesh/position, normal, face, texture   the object in its own frame; its texture's mean colour around vertices; from
+                                           these follow the points that light is known at (`core.fields.body`)
+    radii, proxies, valid                  see `core.fields.field.Field`
+    hidden                                 the whole sphere less the occlusion, of every sample
+    transfer/...                           the transfer, compressed (`core.fields.compression`)
+    self                                   irradiance / pi of the points per light about the object, self transfer
+                                           included: A_l y_i(n) / pi times it
+    self_whole/...                         of objects with a specular lobe: the self transfer, compressed
+
+Whole numbers of more than 8 bits lie as two planes of bytes, the low ones q - 256 high, then the high ones rint(q /
+256): apart, an entropy coder makes the most of either.
 """
 
 from __future__ import annotations
 
-import bisect
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 import relight_formats as formats
-from relightcli.adapters.rays import Tracer
 from relightcli.core.fields.body import Body
-from relightcli.core.fields.build import field_samples
-from relightcli.core.fields.field import Field, SelfTransfer, SourceField
-from relightcli.core.fields.self_transfer import exits_of, solve
-from relightcli.run import blocks as run
-from relightcli.scene.model import Material
-from relightcli.stages.bodies import body_of
+from relightcli.core.fields.compression import CompressedTransfer, places_of
+from relightcli.core.fields.field import SourceField
 
 CHUNK_BYTES = 4_000_000
+SHELL_STEPS = 2047  # from 0 to the largest number of a shell; the rays of a sample are noisier than half a step
+POINT_STEPS = 32767
+
+
+class Packed(NamedTuple):
+    """An array to be put into a store."""
+
+    name: str
+    data: NDArray[Any]
+    dims: tuple[str, ...]
+    attrs: dict[str, Any] | None
+    codec: str
 
 
 @dataclass(frozen=True)
-class FieldSpec:
-    """One field to simulate: where it lies and how. `colours` and `points` are those of its body."""
+class KeptField:
+    """A field as it is kept: see `core.fields.field.Field`; occlusion (S 6nn, N) float32.
 
-    prefix: str
-    material: Material
-    two_sided: bool
-    order: int
-    shells: int
+    self_diffuse (P, N, C) float32: diffuse exit radiance of points of albedo 1 per light about the object; self_whole
+    (P, N, N, C) float32: their self transfer, None where nothing shines.
+    """
+
+    radii: NDArray[np.float64]
     resolution: int
-    proxies: int
-    colours: int
-    points: int
-    rays: int
-    tolerance: float
-    seed: int
-
-    @property
-    def cells(self) -> int:
-        """Samples on a shell."""
-        return 6 * self.resolution * self.resolution
-
-    @property
-    def block(self) -> int:
-        """Samples in a block, which is a chunk: of one shell, about CHUNK_BYTES of transfer."""
-        sample = 4 * self.proxies * self.order**4 * self.colours
-        return max(1, min(self.cells, CHUNK_BYTES // sample))
+    valid: NDArray[np.bool_]
+    proxies: NDArray[np.float64]
+    occlusion: NDArray[np.float32]
+    transfer: CompressedTransfer
+    self_diffuse: NDArray[np.float32]
+    self_whole: NDArray[np.float32] | None
 
 
-@dataclass(frozen=True)
-class SelfJob:
-    """Self transfer: one block a field."""
-
-    partial: str
-    fields: tuple[FieldSpec, ...]
-
-    def open(self) -> SelfWorker:
-        return SelfWorker(self)
-
-
-class SelfWorker:
-    def __init__(self, job: SelfJob) -> None:
-        self.job = job
-
-    def run(self, block: run.Block) -> run.Info:
-        spec = self.job.fields[block.start]
-        body, tracer = open_body(self.job.partial, spec)
-        proxies = formats.worker_array(self.job.partial, f"{spec.prefix}proxies")[:]
-        found = solve(tracer, body, np.asarray(proxies), spec.tolerance, spec.seed)
-        formats.worker_array(self.job.partial, f"{spec.prefix}self")[...] = found.transfer
-        return {"rays": float(found.rays), "noise": found.noise, "reflections": float(found.rounds)}
+def pack_transfer(prefix: str, made: CompressedTransfer, tolerance: float) -> list[Packed]:
+    """A compressed transfer. Coefficients lie component by component: those of one are alike in size."""
+    about = {"shape": list(made.shape), "error": made.error, "tolerance": tolerance}
+    return [
+        Packed(f"{prefix}cluster", made.cluster, ("sample",), None, "zstd"),
+        Packed(f"{prefix}start", made.start, ("cluster_edge",), None, "lz4"),
+        Packed(f"{prefix}component", _planes(made.component), ("byte", "component", "number"), about, "zstd"),
+        Packed(f"{prefix}scale", made.scale, ("component",), None, "lz4"),
+        Packed(f"{prefix}coefficient", _planes(made.coefficient[_by_component(made)]), ("byte", "entry"), None, "zstd"),
+        Packed(f"{prefix}coefficient_scale", made.coefficient_scale, ("component",), None, "lz4"),
+    ]
 
 
-@dataclass(frozen=True)
-class SampleJob:
-    """Samples of fields, whose self transfer is there. Blocks count samples through all fields."""
-
-    partial: str
-    fields: tuple[FieldSpec, ...]
-
-    def open(self) -> SampleWorker:
-        return SampleWorker(self)
-
-
-class SampleWorker:
-    def __init__(self, job: SampleJob) -> None:
-        self.job = job
-        self.first = [0]
-        for spec in job.fields:
-            self.first.append(self.first[-1] + spec.shells * spec.cells)
-        self.opened: tuple[int, Body, Tracer, NDArray[np.float32], NDArray[np.float64]] | None = None
-
-    def run(self, block: run.Block) -> run.Info:
-        k = bisect.bisect_right(self.first, block.start) - 1
-        spec = self.job.fields[k]
-        if self.opened is None or self.opened[0] != k:
-            self.opened = None
-            body, tracer = open_body(self.job.partial, spec)
-            transfer: Any = formats.worker_array(self.job.partial, f"{spec.prefix}self")[...]
-            radii: Any = formats.worker_array(self.job.partial, f"{spec.prefix}radii")[:]
-            self.opened = k, body, tracer, exits_of(body, transfer), radii
-        _, body, tracer, exits, radii = self.opened
-        start, stop = block.start - self.first[k], block.stop - self.first[k]
-        found = field_samples(tracer, body, exits, radii, spec.resolution, start, stop, rays=spec.rays, seed=spec.seed)
-        shell, cell = divmod(start, spec.cells)
-        cells = slice(cell, cell + stop - start)
-        for name, values in (("valid", found.valid), ("occlusion", found.occlusion), ("transfer", found.transfer)):
-            formats.worker_array(self.job.partial, f"{spec.prefix}{name}")[shell, cells] = values
-        return {"rays": float(found.rays)}
-
-
-def open_body(partial: str, spec: FieldSpec) -> tuple[Body, Tracer]:
-    """The body of an unfinished store's field, and rays over its mesh."""
-
-    def read(name: str) -> Any:
-        return formats.worker_array(partial, f"{spec.prefix}mesh/{name}")[...]
-
-    body = body_of(
-        read("position"), read("normal"), read("face"), spec.two_sided, read("texture"), spec.material, spec.order
+def read_transfer(store: formats.Store, prefix: str) -> CompressedTransfer:
+    """What `pack_transfer` made."""
+    read: Any = store.read
+    cluster, start = read(f"{prefix}cluster"), read(f"{prefix}start")
+    about: Any = store.array(f"{prefix}component").attrs
+    component = _from_planes(read(f"{prefix}component"))
+    sorted_ = _from_planes(read(f"{prefix}coefficient"))
+    shape: Any = tuple(int(n) for n in about["shape"])
+    error = float(about["error"])
+    scales = read(f"{prefix}scale"), read(f"{prefix}coefficient_scale")
+    made = CompressedTransfer(
+        shape, cluster, start, component, scales[0], sorted_, scales[1], error, places_of(cluster, start)
     )
-    return body, Tracer(body.positions, body.faces)
+    coefficient = np.empty_like(sorted_)
+    coefficient[_by_component(made)] = sorted_
+    return CompressedTransfer(**{**made.__dict__, "coefficient": coefficient})
+
+
+def _by_component(made: CompressedTransfer) -> NDArray[np.int64]:
+    """Places of the coefficients, sorted by their components, then samples."""
+    count = np.diff(made.first)
+    number = np.arange(made.first[-1]) - np.repeat(made.first[:-1], count)
+    component = np.repeat(made.start[made.cluster], count) + number
+    out: NDArray[np.int64] = np.argsort(component.astype(np.int32), kind="stable")
+    return out
+
+
+def pack_per_shell(name: str, values: NDArray[np.floating]) -> list[Packed]:
+    """Values (S, samples, N), in SHELL_STEPS of the largest of every shell and coefficient."""
+    return _pack_rounded(name, values, 1, SHELL_STEPS, ("shell", "direction", "harmonic"), ("shell", "harmonic"))
+
+
+def rounded(name: str, values: NDArray[np.floating], dims: tuple[str, ...]) -> list[Packed]:
+    """Values (P, ...), in POINT_STEPS of the largest of every row."""
+    return _pack_rounded(name, values, tuple(range(1, values.ndim)), POINT_STEPS, dims, dims[:1])
+
+
+def _pack_rounded(
+    name: str,
+    values: NDArray[np.floating],
+    axis: int | tuple[int, ...],
+    steps: int,
+    dims: tuple[str, ...],
+    scale_dims: tuple[str, ...],
+) -> list[Packed]:
+    scale = (np.abs(values).max(axis=axis, keepdims=True, initial=0.0) / steps).astype(np.float32)
+    codes = np.rint(values / np.where(scale > 0.0, scale, 1.0).astype(np.float64))
+    small = np.clip(codes, -steps, steps).astype(np.int16)
+    return [
+        Packed(name, _planes(small), ("byte", *dims), {"scale": f"{name}_scale"}, "zstd"),
+        Packed(f"{name}_scale", np.squeeze(scale, axis), scale_dims, None, "lz4"),
+    ]
+
+
+def _planes(codes: NDArray[np.int16]) -> NDArray[np.int8]:
+    high = (codes.astype(np.int32) + 128) >> 8
+    return np.stack([codes - 256 * high, high]).astype(np.int8)
+
+
+def _from_planes(planes: NDArray[np.int8]) -> NDArray[np.int16]:
+    out: NDArray[np.int16] = planes[0] + planes[1].astype(np.int16) * np.int16(256)
+    return out
+
+
+def put_packed(writer: formats.Writer, prefix: str, packed: list[Packed]) -> None:
+    """Puts arrays under a prefix; once more is harmless."""
+    for array in packed:
+        codec: Any = array.codec
+        writer.put(f"{prefix}{array.name}", array.data, dims=array.dims, attrs=array.attrs, codec=codec)
 
 
 def put_body(
     writer: formats.Writer,
-    spec: FieldSpec,
+    prefix: str,
     body: Body,
     texture: NDArray[np.float32],
     radii: NDArray[np.float64],
     proxies: NDArray[np.float64],
 ) -> None:
-    """The mesh and what is known before any ray; and the arrays that the blocks fill. texture (V, 3)."""
-    p, n = spec.prefix, spec.order**2
-    writer.put(f"{p}mesh/position", body.positions, dims=("vertex", "axis"))
-    writer.put(f"{p}mesh/normal", body.normals, dims=("vertex", "axis"))
-    writer.put(f"{p}mesh/face", body.faces, dims=("face", "corner"))
-    writer.put(f"{p}mesh/texture", texture, dims=("vertex", "colour"))
-    writer.put(f"{p}point", body.point, dims=("point", "axis"))
-    writer.put(f"{p}normal", body.normal, dims=("point", "axis"))
-    writer.put(f"{p}vertex", body.vertex, dims=("point",))
-    writer.put(f"{p}side", body.side, dims=("point",))
-    writer.put(f"{p}radii", radii, dims=("shell",))
-    writer.put(f"{p}proxies", proxies, dims=("proxy", "axis"))
-    m, c = spec.proxies, spec.colours
-    matrix = ("proxy", "harmonic", "light_harmonic", "reflected_colour")
-    rows = max(1, CHUNK_BYTES // (4 * m * n * n * c))
-    writer.array(
-        f"{p}self",
-        shape=(spec.points, m, n, n, c),
-        dtype=np.float32,
-        chunks=(rows, m, n, n, c),
-        dims=("point", *matrix),
-        attrs={"description": "light that a point receives per light at a proxy"},
-    )
-    shape, chunks = (spec.shells, spec.cells), (1, spec.block)
-    writer.array(f"{p}valid", shape=shape, dtype=bool, chunks=chunks, dims=("shell", "direction"))
-    writer.array(
-        f"{p}occlusion",
-        shape=(*shape, n),
-        dtype=np.float32,
-        chunks=(*chunks, n),
-        dims=("shell", "direction", "harmonic"),
-        attrs={"description": "what passes the object"},
-    )
-    writer.array(
-        f"{p}transfer",
-        shape=(*shape, m, n, n, c),
-        dtype=np.float32,
-        chunks=(*chunks, m, n, n, c),
-        dims=("shell", "direction", *matrix),
-        attrs={"description": "radiance of the object per light at a proxy"},
-    )
-
-
-def simulate(
-    writer: formats.Writer, specs: list[FieldSpec], workers: int, quiet: bool, scheduler: str | None = None
-) -> None:
-    """Every block of the fields that `put_body` has laid down and the ledger does not hold."""
-    fields = tuple(specs)
-    partial = str(writer.partial_path)
-    own = [run.Block(f"{s.prefix or 'field/'}self", k, k + 1) for k, s in enumerate(specs)]
-    job = SelfJob(partial, fields)
-    run.run_blocks(job, own, writer, workers=workers, label="self transfer", quiet=quiet, scheduler=scheduler)
-    blocks, first = [], 0
-    for spec in specs:
-        for shell in range(spec.shells):
-            for cell in range(0, spec.cells, spec.block):
-                start = first + shell * spec.cells + cell
-                stop = min(start + spec.block, first + (shell + 1) * spec.cells)
-                blocks.append(run.Block(f"{spec.prefix or 'field/'}samples/{shell:03d}/{cell:06d}", start, stop))
-        first += spec.shells * spec.cells
-    samples = SampleJob(partial, fields)
-    run.run_blocks(samples, blocks, writer, workers=workers, label="fields", quiet=quiet, scheduler=scheduler)
-    run.close_worker()
+    """The mesh and what is known before any ray. texture (V, 3)."""
+    writer.put(f"{prefix}mesh/position", body.positions, dims=("vertex", "axis"))
+    writer.put(f"{prefix}mesh/normal", body.normals, dims=("vertex", "axis"))
+    writer.put(f"{prefix}mesh/face", body.faces, dims=("face", "corner"))
+    writer.put(f"{prefix}mesh/texture", texture, dims=("vertex", "colour"))
+    writer.put(f"{prefix}radii", radii, dims=("shell",))
+    writer.put(f"{prefix}proxies", proxies, dims=("proxy", "axis"))
 
 
 def copy_field(store: formats.Store, writer: formats.Writer, prefix: str) -> None:
@@ -212,7 +167,8 @@ def copy_field(store: formats.Store, writer: formats.Writer, prefix: str) -> Non
     for name in store.names():
         layout = store.layouts[name]
         source = store.array(name)
-        attrs = {k: v for k, v in source.attrs.items() if k == "description"}
+        attrs = {k: v for k, v in source.attrs.items() if k != "units"}
+        codec: Any = layout.codec
         target = writer.array(
             f"{prefix}{name}",
             shape=layout.shape,
@@ -220,43 +176,77 @@ def copy_field(store: formats.Store, writer: formats.Writer, prefix: str) -> Non
             chunks=layout.chunks,
             dims=layout.dims,
             attrs=attrs or None,
+            codec=codec,
         )
         for start in range(0, layout.shape[0], layout.chunks[0]):
             rows = slice(start, start + layout.chunks[0])
             target[rows] = source[rows]
 
 
-def read_field(store: formats.Store, prefix: str = "") -> tuple[Field, SelfTransfer]:
+def read_field(store: formats.Store, prefix: str = "") -> KeptField:
     """The field under a prefix of a finished store."""
     read: Any = store.read
-    radii, valid = read(f"{prefix}radii"), read(f"{prefix}valid")
-    position, face = read(f"{prefix}mesh/position"), read(f"{prefix}mesh/face")
-    corners = position[np.unique(face)]
-    center = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
-    radius = float(np.sqrt(((corners - center) ** 2).sum(axis=1).max()))
-    field = Field(
-        center,
-        radius,
-        radii,
+    valid = read(f"{prefix}valid")
+    hidden = _from_planes(read(f"{prefix}hidden")) * read(f"{prefix}hidden_scale")[:, None, :]
+    occlusion = -hidden.reshape(-1, hidden.shape[2])
+    occlusion[:, 0] += np.float32(np.sqrt(4.0 * np.pi))
+    own = _from_planes(read(f"{prefix}self")) * read(f"{prefix}self_scale")[:, None, None]
+    whole = None
+    if f"{prefix}self_whole/start" in store:
+        whole = read_transfer(store, f"{prefix}self_whole/").decompress()[:, 0]
+    return KeptField(
+        read(f"{prefix}radii"),
         round((valid.shape[1] / 6) ** 0.5),
         valid,
         read(f"{prefix}proxies"),
-        read(f"{prefix}occlusion"),
-        read(f"{prefix}transfer"),
+        occlusion,
+        read_transfer(store, f"{prefix}transfer/"),
+        own,
+        whole,
     )
-    return field, SelfTransfer(read(f"{prefix}self"))
 
 
-def put_source(writer: formats.Writer, prefix: str, field: SourceField) -> None:
+def put_source(writer: formats.Writer, prefix: str, field: SourceField, radiance: tuple[float, float, float]) -> None:
     """The field of a local light."""
+    brightest = int(np.argmax(radiance))
+    seen = field.radiance[..., brightest].astype(np.float64) / (radiance[brightest] or 1.0)
     writer.put(f"{prefix}radii", field.radii, dims=("shell",), units="m")
     writer.put(f"{prefix}radius", np.array(field.radius), dims=(), units="m")
-    writer.put(f"{prefix}radiance", field.radiance, dims=("shell", "direction", "harmonic", "colour"))
+    writer.put(f"{prefix}radiance", np.array(radiance, np.float32), dims=("colour",))
+    put_packed(writer, prefix, pack_per_shell("seen", seen))
 
 
 def read_source(store: formats.Store, prefix: str) -> SourceField:
     """The field of a local light, about its centre, with the scene's axes."""
     read: Any = store.read
-    radiance = read(f"{prefix}radiance")
-    resolution = round((radiance.shape[1] / 6) ** 0.5)
-    return SourceField(np.zeros(3), float(read(f"{prefix}radius")), read(f"{prefix}radii"), resolution, radiance)
+    seen = _from_planes(read(f"{prefix}seen")) * read(f"{prefix}seen_scale")[:, None, :]
+    resolution = round((seen.shape[1] / 6) ** 0.5)
+    radius = float(read(f"{prefix}radius"))
+    radiance = seen[..., None] * read(f"{prefix}radiance")
+    return SourceField(np.zeros(3), radius, read(f"{prefix}radii"), resolution, radiance)
+
+
+def describe_fields(store: formats.Store) -> list[dict[str, Any]]:
+    """Of every field in a store: whose it is, the transfer's error, its bytes and what they were before."""
+    out = []
+    objects = store.attrs.get("fields", {}).get("objects", {})
+    sizes = store.sizes()
+    for name in store.names():
+        if not name.endswith("transfer/component"):
+            continue
+        group = name.removesuffix("component")
+        prefix = group.removesuffix("transfer/")
+        about: Any = store.array(name).attrs
+        samples = store.layouts[f"{group}cluster"].shape[0]
+        out.append(
+            {
+                "field": prefix.rstrip("/"),
+                "objects": [o for o, entry in objects.items() if f"fields/{entry['field']}/" == prefix],
+                "error": float(about["error"]),
+                "tolerance": float(about["tolerance"]),
+                "bytes": sum(size.stored for key, size in sizes.items() if key.startswith(prefix)),
+                "transfer_bytes": sum(size.stored for key, size in sizes.items() if key.startswith(group)),
+                "transfer_raw_bytes": 4 * samples * int(np.prod(about["shape"])),
+            }
+        )
+    return out

@@ -19,6 +19,7 @@ from relightcli import __version__
 from relightcli.adapters.gltf import buffer_files
 from relightcli.adapters.rays import Tracer
 from relightcli.core.fields.adaptive import adaptive_radii, least_resolution
+from relightcli.core.fields.albedos import NODES
 from relightcli.core.fields.body import Body
 from relightcli.core.fields.build import RAYS, field_samples
 from relightcli.core.fields.field import shell_radii
@@ -31,26 +32,30 @@ from relightcli.scene.bodies import OwnMesh, own_mesh, put_meshes, vertex_number
 from relightcli.scene.materials import table_from_material
 from relightcli.scene.model import Geometry, Scene
 from relightcli.stages.bodies import body_of
-from relightcli.stages.field_store import FieldSpec, copy_field, put_body, put_source, simulate
+from relightcli.stages.field_job import FieldSpec, simulate
+from relightcli.stages.field_store import copy_field, put_body, put_source
 
 KIND = "field"
 DIFFUSE_RESOLUTION, GLOSSY_RESOLUTION = 16, 32  # [Pan 2007, section 6]
 SPACINGS = ("geometric", "paper", "adaptive")
 DIRECTION_ERROR = 0.05  # relative, that `adaptive` allows between the directions of the innermost sphere
 PILOT_SHELLS, PILOT = 4, 32  # spheres and samples of each that a dry run traces
+DIFFUSE_TOLERANCE, GLOSSY_TOLERANCE = 0.01, 0.02  # of the compressed transfer
+RATIO = 25.0  # that a dry run counts on
 NOISE = 0.5  # of the scene's tolerance: what the self transfer's own noise may be
 
 
 @dataclass(frozen=True)
 class FieldSettings:
     """What `--field-*` says. resolution None: by measured error where `spacing` is adaptive; else 16, and 32 for
-    objects with a specular lobe."""
+    objects with a specular lobe. tolerance None: 0.01, and 0.02 for these."""
 
     shells: int = 16
     resolution: int | None = None
     proxies: int = 8
     order: int = 4
     spacing: str = "geometric"
+    tolerance: float | None = None
     library: Path | None = None
 
     def check(self) -> None:
@@ -63,6 +68,9 @@ class FieldSettings:
         ):
             if not low <= value <= high:
                 raise InputError(f"--field-{name}: expected {low} to {high}; found {value}")
+        tolerance = self.tolerance_of(False)
+        if not 0.001 <= tolerance <= 0.5:
+            raise InputError(f"--field-tolerance: expected 0.001 to 0.5; found {tolerance}")
         if self.spacing not in SPACINGS:
             raise InputError(f"--field-spacing: expected one of {', '.join(SPACINGS)}; found {self.spacing!r}")
 
@@ -72,6 +80,12 @@ class FieldSettings:
             return GLOSSY_RESOLUTION if glossy else DIFFUSE_RESOLUTION
         return self.resolution
 
+    def tolerance_of(self, glossy: bool) -> float:
+        """Relative error of the compressed transfer."""
+        if self.tolerance is None:
+            return GLOSSY_TOLERANCE if glossy else DIFFUSE_TOLERANCE
+        return self.tolerance
+
     def as_json(self) -> dict[str, Any]:
         """What the store's bytes hang on."""
         return {
@@ -80,16 +94,19 @@ class FieldSettings:
             "proxies": self.proxies,
             "order": self.order,
             "spacing": self.spacing,
+            "transfer_tolerance": self.tolerance,
         }
 
 
 @dataclass(frozen=True)
 class Mover:
-    """One rigid object: its mesh in its own frame, the body, and the number of its field."""
+    """One rigid object: its mesh in its own frame, the body, the number of its field, and whether that holds for any
+    albedo (`core.fields.albedos`)."""
 
     mesh: OwnMesh
     body: Body
     field: int
+    any_albedo: bool
 
 
 @dataclass(frozen=True)
@@ -130,6 +147,9 @@ def find_movers(scene: Scene, settings: FieldSettings, cut: bool, seed: int) -> 
         mesh = own_mesh(scene, name, cut)
         texture = vertex_colours(mesh.geometry)
         own = mesh.geometry
+        any_albedo = material.adjustable and material.model == "lambert" and bool((texture == texture[:, :1]).all())
+        if any_albedo:
+            material = replace(material, diffuse=NODES)
         body = body_of(own.positions, own.normals, own.faces, spec.two_sided, texture, material, settings.order)
         files = [spec.mesh, *buffer_files(spec.mesh)]
         if material.diffuse_texture is not None:
@@ -163,10 +183,11 @@ def find_movers(scene: Scene, settings: FieldSettings, cut: bool, seed: int) -> 
                 len(body.point),
                 RAYS,
                 NOISE * scene.tolerance,
+                settings.tolerance_of(body.terms > 1),
                 seed,
             )
             fields.append(Distinct(field, body, texture, radii, proxies, made, inputs))
-        movers.append(Mover(mesh, body, known[key]))
+        movers.append(Mover(mesh, body, known[key], any_albedo))
     return Moving(tuple(movers), tuple(fields))
 
 
@@ -223,8 +244,8 @@ def add_points(
 def describe(moving: Moving, scene: Scene, starts: tuple[int, ...]) -> dict[str, Any]:
     """The attribute `fields` of the store.
 
-    objects: name to the number of its field, its first receiver and their number, and its placement (4, 4), own frame
-    to world; lights: name to the number of its source field, under `sources/`.
+    objects: name to the number of its field, its first receiver and their number, its placement (4, 4), own frame to
+    world, and whether the field holds for any albedo; lights: name to the number of its source field, under `sources/`.
     """
     objects = {
         mover.mesh.name: {
@@ -232,6 +253,7 @@ def describe(moving: Moving, scene: Scene, starts: tuple[int, ...]) -> dict[str,
             "first": starts[1 + i],
             "count": len(mover.body.point),
             "placement": mover.mesh.placement.tolist(),
+            "any_albedo": mover.any_albedo,
         }
         for i, mover in enumerate(moving.movers)
     }
@@ -259,11 +281,12 @@ def put_fields(
     spacing = "geometric" if settings.spacing == "adaptive" else settings.spacing
     for j, light in enumerate(scene.lights.values()):
         source = source_field(light, settings.shells, settings.resolution_of(False), settings.order, spacing)
-        put_source(writer, f"sources/{j}/", source)
+        put_source(writer, f"sources/{j}/", source, light.radiance)
 
 
 def predict(moving: Moving) -> tuple[float, float, float]:
-    """Rays, seconds of one process and bytes that the fields take, from a pilot of samples. Bytes: uncompressed."""
+    """Rays, seconds of one process and bytes that the fields take, from a pilot of samples. Bytes: as
+    RATIO says."""
     rays = seconds = size = 0.0
     for field in moving.fields:
         spec, body = field.spec, field.body
@@ -281,7 +304,7 @@ def predict(moving: Moving) -> tuple[float, float, float]:
         samples = spec.shells * spec.cells
         seconds += taken * samples / (PILOT_SHELLS * min(PILOT, spec.cells))
         rays += float(samples * spec.rays)
-        size += 4.0 * (samples + spec.points) * spec.order**2 * lights
+        size += 4.0 * samples * spec.order**2 * lights / RATIO
     return rays, seconds, size
 
 
@@ -309,4 +332,4 @@ def _from_library(
 
 
 def _put_body(writer: formats.Writer, field: Distinct) -> None:
-    put_body(writer, field.spec, field.body, field.texture, field.radii, field.proxies)
+    put_body(writer, field.spec.prefix, field.body, field.texture, field.radii, field.proxies)

@@ -8,6 +8,7 @@ from typing import Any
 import relight_formats as formats
 from relightcli.errors import StoreError
 from relightcli.stages.budget import budget, costs
+from relightcli.stages.field_store import describe_fields
 
 
 def inspect(path: Path, verify: bool) -> dict[str, Any]:
@@ -47,6 +48,9 @@ def inspect(path: Path, verify: bool) -> dict[str, Any]:
         "before": store.summary.get("before", []),
         "summary": store.summary,
     }
+    fields = describe_fields(store)
+    if fields:
+        result["fields"] = fields
     models = [_model(block) for block in store.blocks if store.kind == "pose" and block["id"].startswith("fit/")]
     if models:
         result["models"] = models

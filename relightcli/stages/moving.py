@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +46,6 @@ from relightcli.core.sphere import sh
 from relightcli.core.transport.light_visibility import light_bits
 from relightcli.core.transport.local_lights import LocalLights, pack_lights
 from relightcli.core.transport.transfer import local_rotations
-from relightcli.errors import InputError
 from relightcli.scene.model import Geometry, Material
 from relightcli.scene.moving import apply_moves, inverse_affine, move_geometry
 from relightcli.stages.lighting import LightingStore, Radiance, _Coats
@@ -179,13 +178,11 @@ class MovingStore(LightingStore):
         basis: str | None = None,
         bounces: int | None = None,
     ) -> list[Radiance]:
-        """See `LightingStore.exit_radiance`. Raises InputError where a mover's material is not its fields'."""
-        for mover in self.movers:
-            if materials[mover.material] != self.scene.materials[mover.material]:
-                raise InputError(
-                    f"--set {mover.material}: is the material of {mover.name!r}, which moves: its fields hold for the "
-                    "material in the scene file. Change it there and precompute again, or add --reference."
-                )
+        """See `LightingStore.exit_radiance`. Raises InputError where a mover's fields do not hold for its material."""
+        for e, mover in enumerate(self.movers):
+            self.movers[e] = mover.dyed(materials[mover.material])
+            if self._placed is not None:
+                self._placed.entities[e] = replace(self._placed.entities[e], own=self.movers[e].own)
         started = time.perf_counter()
         parts = super().exit_radiance(environment, rotate, materials, view, active, basis, bounces)
         if not self.apart:

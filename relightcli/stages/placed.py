@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,59 +11,38 @@ from numpy.typing import NDArray
 import relight_formats as formats
 from relightcli.adapters.rays import Tracer
 from relightcli.core.brdf.models import SPECULAR, pack_materials
-from relightcli.core.fields.body import Body
-from relightcli.core.fields.entities import Entity, PlainTransfer, Surroundings, of_light
+from relightcli.core.fields.albedos import self_weights, transfer_at
+from relightcli.core.fields.body import Body, axes
+from relightcli.core.fields.entities import Entity, Surroundings, of_light
 from relightcli.core.fields.interpolate import make_grid
-from relightcli.core.fields.shade import Receivers, make_receivers
+from relightcli.core.fields.shade import Receivers
 from relightcli.core.fields.standing import Between, between
+from relightcli.core.sphere.rotation import rotation_matrices
 from relightcli.errors import InputError
 from relightcli.scene.model import Material, RectangleLight, SphereLight
 from relightcli.stages.bodies import body_of
-from relightcli.stages.field_store import read_source
+from relightcli.stages.field_store import KeptField, read_field, read_source
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 SITES = 64  # points of an object that look around at what stands
 INWARDS = 0.01  # of the way to the centre that they lie within: what stands on a floor does not look from below it
+_SLAB = 2048  # points at a time
 SIMILAR = 1e-6  # relative, by which a placement may differ from a rotation and a size
-
-
-class StoredTransfer:
-    """The transfer of a field's samples, read from its store chunk by chunk as samples are asked for."""
-
-    def __init__(self, array: Any) -> None:
-        self.array, self.block, self.cells = array, array.chunks[1], array.shape[1]
-        self._read: dict[tuple[int, int], PlainTransfer] = {}
-
-    def reflect(self, light: NDArray[np.floating], which: NDArray[np.integer]) -> F32:
-        """See `entities.Transfer`. which: rising."""
-        out = np.empty((len(which), 3, light.shape[2]), np.float32)
-        shell, cell = np.divmod(which, self.cells)
-        number = shell * (1 + self.cells // self.block) + cell // self.block
-        for a, b in _runs(number):
-            at = int(shell[a]), int(cell[a]) // self.block
-            if at not in self._read:
-                first = at[1] * self.block
-                rows = np.asarray(self.array[at[0], first : first + self.block], np.float32)
-                self._read[at] = PlainTransfer(rows)
-            out[a:b] = self._read[at].reflect(light, cell[a:b] - at[1] * self.block)
-        return out
-
-
-def _runs(number: NDArray[np.integer]) -> list[tuple[int, int]]:
-    cuts = np.concatenate([[0], np.flatnonzero(np.diff(number)) + 1, [len(number)]]).tolist()
-    return [(a, b) for a, b in itertools.pairwise(cuts) if b > a]
 
 
 @dataclass(frozen=True)
 class Mover:
     """One object that may be moved. rows: its receivers; placement (4, 4): from its field's frame to where the scene
-    has it; sites (S, 3) on it in the field's frame, after its proxies; spread: how its points take light from those."""
+    has it; kept: the field, if it holds for any albedo; made_for: the material of `own` and `receivers`; sites (S, 3)
+    on it in the field's frame, after its proxies; spread: how its points take light from those."""
 
     name: str
     rows: slice
     placement: F64
     material: str
+    kept: KeptField | None
+    made_for: Material
     body: Body
     own: Surroundings
     tracer: Tracer
@@ -77,6 +54,20 @@ class Mover:
     @property
     def proxies(self) -> int:
         return 0 if self.own.proxies is None else len(self.own.proxies)
+
+    def dyed(self, material: Material) -> Mover:
+        """With another diffuse colour. Raises InputError for what its field does not hold for."""
+        if material == self.made_for:
+            return self
+        if self.kept is None or replace(material, diffuse=self.made_for.diffuse) != self.made_for:
+            raise InputError(
+                f"--set {self.material}: is the material of {self.name!r}, which moves: of its fields, only the "
+                "diffuse colour of an adjustable lambert material without a coloured texture can be changed. Change "
+                "the scene file and precompute again, or add --reference."
+            )
+        own = replace(self.own, transfer=transfer_at(self.kept.transfer, material.diffuse))
+        receivers = _receivers(self.body, self.kept, material, any_albedo=True)
+        return replace(self, made_for=material, own=own, receivers=receivers)
 
     def at(self, matrix: F64) -> Entity:
         """The object placed by (4, 4), a rotation times a positive number and a translation."""
@@ -99,11 +90,11 @@ def similarity(name: str, matrix: F64) -> tuple[F64, F64, float]:
 def read_movers(store: formats.Store, scene_materials: dict[str, Material], objects: dict[str, Any]) -> list[Mover]:
     """Everything that the store has fields of; objects: the scene's, by name."""
     order = int(store.settings["fields"]["order"])
-    parts: dict[tuple[int, str, bool], tuple[Any, ...]] = {}
+    parts: dict[tuple[int, str, bool, bool], tuple[Any, ...]] = {}
     movers = []
     for name, about in store.attrs["fields"]["objects"].items():
         spec = objects[name]
-        key = int(about["field"]), str(spec.material), bool(spec.two_sided)
+        key = int(about["field"]), str(spec.material), bool(spec.two_sided), bool(about["any_albedo"])
         if key not in parts:
             parts[key] = _read_object(store, key, scene_materials[spec.material], order)
         rows = slice(int(about["first"]), int(about["first"]) + int(about["count"]))
@@ -111,31 +102,58 @@ def read_movers(store: formats.Store, scene_materials: dict[str, Material], obje
     return movers
 
 
-def _read_object(store: formats.Store, key: tuple[int, str, bool], material: Material, order: int) -> tuple[Any, ...]:
+def _read_object(
+    store: formats.Store, key: tuple[int, str, bool, bool], material: Material, order: int
+) -> tuple[Any, ...]:
+    """The parts of a mover from `kept` on."""
     prefix = f"fields/{key[0]}/"
     read: Any = store.read
     position, face = read(f"{prefix}mesh/position"), read(f"{prefix}mesh/face")
     body = body_of(position, read(f"{prefix}mesh/normal"), face, key[2], read(f"{prefix}mesh/texture"), material, order)
-    radii, valid = read(f"{prefix}radii"), read(f"{prefix}valid")
-    proxies = read(f"{prefix}proxies")
+    kept, any_albedo = read_field(store, prefix), key[3]
     used = position[np.unique(face)]
     own = Surroundings(
-        make_grid(radii, round(math.sqrt(valid.shape[1] / 6)), valid),
+        make_grid(kept.radii, kept.resolution, kept.valid),
         body.center,
         np.stack([used.min(axis=0), used.max(axis=0)]),
         body.radius,
-        read(f"{prefix}occlusion").reshape(-1, order * order),
-        StoredTransfer(store.array(f"{prefix}transfer")),
+        kept.occlusion,
+        transfer_at(kept.transfer, material.diffuse) if any_albedo else kept.transfer,
         None,
-        proxies,
+        kept.proxies,
     )
-    albedo = np.broadcast_to(np.array(material.diffuse, np.float32), body.albedo.shape)  # texture acts in the picture
-    receivers = make_receivers(body.normal, albedo, order, read(f"{prefix}self"), body.terms > 1)
     colour = pack_materials([material]).parameters[0, SPECULAR : SPECULAR + 3].astype(np.float32)
     chosen = np.unique(np.linspace(0, len(body.point) - 1, SITES).astype(int))
     on_surface = body.point[chosen]
-    sites = np.concatenate([proxies, on_surface + INWARDS * (body.center - on_surface)])
-    return body, own, Tracer(body.positions, body.faces), receivers, colour, sites, between(body.point, on_surface)
+    sites = np.concatenate([kept.proxies, on_surface + INWARDS * (body.center - on_surface)])
+    return (
+        kept if any_albedo else None,
+        material,
+        body,
+        own,
+        Tracer(body.positions, body.faces),
+        _receivers(body, kept, material, any_albedo),
+        colour,
+        sites,
+        between(body.point, on_surface),
+    )
+
+
+def _receivers(body: Body, kept: KeptField, material: Material, any_albedo: bool) -> Receivers:
+    """What the points make of light; their texture acts in the picture."""
+    of_white = kept.self_diffuse
+    if any_albedo:
+        of_white = of_white @ self_weights(material.diffuse).astype(np.float32)
+    to_diffuse = of_white * np.array(material.diffuse, np.float32)
+    to_frame = np.zeros((0, body.order**2, body.order**2, 1), np.float32)
+    if kept.self_whole is not None:
+        to_frame = np.empty_like(kept.self_whole)
+        frames = axes(body.normal)
+        for a in range(0, len(to_frame), _SLAB):
+            part = slice(a, a + _SLAB)
+            turns = rotation_matrices(frames[part], body.order)
+            to_frame[part] = np.einsum("pki,pijc->pkjc", turns, kept.self_whole[part])
+    return Receivers(to_diffuse, to_frame, body.normal)
 
 
 def read_lights(store: formats.Store, lights: dict[str, SphereLight | RectangleLight]) -> dict[str, Surroundings]:

@@ -44,6 +44,7 @@ class Config:
     field_proxies: int = 8
     field_order: int = 4
     field_spacing: str = "geometric"
+    field_tolerance: float | None = None
     field_library: Path | None = None
     seed: int = 0
     workers: int = 1
@@ -62,6 +63,7 @@ class Config:
             self.field_proxies,
             self.field_order,
             self.field_spacing,
+            self.field_tolerance,
             self.field_library,
         )
 

@@ -175,6 +175,29 @@ def test_workers_get_the_arrays_that_were_made_and_no_others(tmp_path: Path) -> 
             worker_array(writer.partial_path, "../a")
 
 
+def test_what_only_the_work_needs_is_dropped(tmp_path: Path) -> None:
+    """Also after a crash halfway through, of which a group with some of its files is left."""
+    with new(tmp_path / "store") as writer:
+        for name in ("f/work/a", "f/work/b", "f/works", "f/kept"):
+            writer.put(name, np.zeros(2), dims=("V",))
+        writer.record("made", {})
+        writer.drop("f/work/b")
+        assert sorted(writer.layouts) == ["f/kept", "f/work/a", "f/works"]
+        (writer.partial_path / "f/work/a/zarr.json").unlink()
+    again = begin(tmp_path / "store", "test", settings={}, inputs={}, program="test 1")
+    assert again is not None
+    with again as writer:
+        assert writer.done == {"made"}
+        writer.drop("f/work")
+        writer.drop("f/work")
+        with pytest.raises(ValueError, match="expected letters"):
+            writer.drop("../store")
+        writer.commit({})
+    store = open_store(tmp_path / "store")
+    assert store.names() == ["f/kept", "f/works"]
+    assert store.verify() == []
+
+
 def test_leftover_temporary_files_are_swept(tmp_path: Path) -> None:
     with new(tmp_path / "store") as writer:
         writer.put("a", np.zeros(2), dims=("V",))

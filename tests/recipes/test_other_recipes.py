@@ -42,3 +42,12 @@ def test_light_painting_changes_some_clusters_a_stroke_and_ends_where_a_full_rel
     assert "passed" in done.stderr + done.stdout
     assert {p.name for p in (tmp_path / "pictures").iterdir()} == {f"{k:02d}.png" for k in range(6)}
     assert (tmp_path / "clusters.png").stat().st_size > 10_000
+
+
+def test_pieces_are_simulated_once_and_stand_where_they_are_put(make, tmp_path):
+    done = make("pieces", OUT=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (done.stdout + done.stderr).count("passed") == 3
+    assert len(list((tmp_path / "library").glob("*.zarr"))) == 3
+    strict = make("pieces", OUT=tmp_path, LIMIT=0.001)
+    assert strict.returncode != 0

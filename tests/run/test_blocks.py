@@ -52,6 +52,23 @@ def test_every_block_is_done_once(tmp_path, workers):
     assert info["peak_bytes"] > 1e6
 
 
+@pytest.mark.parametrize("workers", [1, 2])
+def test_apart_means_never_in_this_process(tmp_path, workers):
+    """Not even one block that is left: where linear algebra has one thread, it gives the same bytes."""
+    run_blocks(
+        Counting(str(tmp_path)),
+        split("v", 2, 2),
+        FileLedger(tmp_path),
+        workers=workers,
+        label="test",
+        quiet=True,
+        apart=True,
+    )
+    opened = (tmp_path / "opened").read_text().split()
+    assert len(opened) == 1
+    assert opened[0] != str(os.getpid())
+
+
 def test_what_is_done_is_not_done_again(tmp_path):
     ledger = FileLedger(tmp_path)
     blocks = split("v", 6, 2)

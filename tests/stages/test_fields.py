@@ -7,17 +7,20 @@ import pytest
 
 import relight_formats as formats
 from relightcli.adapters.rays import Tracer
+from relightcli.core.fields.body import make_body
 from relightcli.core.fields.build import build_field
+from relightcli.core.fields.self_transfer import diffuse_part
 from relightcli.errors import InputError, StoreError
 from relightcli.run import blocks as run
 from relightcli.scene.bodies import own_frame
-from relightcli.scene.model import Camera
+from relightcli.scene.model import Camera, Material
 from relightcli.scene.parse import load_scene
-from relightcli.stages import field_store
+from relightcli.stages import field_job
 from relightcli.stages.cluster import Config as ClusterConfig
 from relightcli.stages.cluster import cluster
 from relightcli.stages.field_store import read_field, read_source
 from relightcli.stages.fields import FieldSettings, find_movers
+from relightcli.stages.inspect import inspect
 from relightcli.stages.light_clusters import Config as LightConfig
 from relightcli.stages.light_clusters import cluster_lights
 from tests.core.transport.scenes import lambert, sphere, square
@@ -76,14 +79,24 @@ def test_alike_objects_share_a_field(store):
 def test_fields_are_those_of_the_objects_alone(scene, store):
     moving = find_movers(load_scene(scene), FieldSettings(2, 2, 2), False, 0)
     for k, distinct in enumerate(moving.fields):
-        field, own = read_field(store, f"fields/{k}/")
+        field = read_field(store, f"fields/{k}/")
         wanted, wanted_own = build_field(
             Tracer(distinct.body.positions, distinct.body.faces), distinct.body, 2, 2, 2, tolerance=0.01
         )
-        for name in ("center", "radii", "valid", "proxies", "occlusion", "transfer"):
+        for name in ("radii", "valid", "proxies"):
             np.testing.assert_array_equal(getattr(field, name), getattr(wanted, name), err_msg=name)
-        assert (field.radius, field.resolution) == (wanted.radius, wanted.resolution)
-        np.testing.assert_array_equal(own.transfer, wanted_own.transfer)
+        assert field.resolution == wanted.resolution
+        for s, (ours, truth) in enumerate(zip(field.occlusion.reshape(2, 24, 16), wanted.occlusion, strict=True)):
+            even = np.eye(1, 16)[0] * np.sqrt(4 * np.pi)
+            step = np.abs(even - truth).max(axis=0) / 2047
+            assert (np.abs(ours - truth) <= 0.5 * step + 1e-6).all(), s
+        transfer = wanted.transfer.reshape(-1, *wanted.transfer.shape[2:])
+        missing = np.linalg.norm(field.transfer.decompress() - transfer) / np.linalg.norm(transfer)
+        assert missing == pytest.approx(field.transfer.error, rel=1e-3)
+        assert 0.001 < missing <= 0.0101  # 1 % of leeway: rounding errors are counted as evenly spread
+        diffuse = diffuse_part(distinct.body, wanted_own.transfer)
+        np.testing.assert_allclose(field.self_diffuse, diffuse, atol=np.abs(diffuse).max() / 2 / 32767 * 1.001)
+        assert field.self_whole is None
     assert [f.spec.colours for f in moving.fields] == [1, 3]
 
 
@@ -91,8 +104,10 @@ def test_points_are_receivers_in_the_order_of_their_field(store):
     position, normal = store.read("receivers/position"), store.read("receivers/normal")
     for name, entry in store.attrs["fields"]["objects"].items():
         rows = slice(entry["first"], entry["first"] + entry["count"])
-        matrix, prefix = np.array(entry["placement"]), f"fields/{entry['field']}/"
-        point = store.read(f"{prefix}point") @ matrix[:3, :3].T + matrix[:3, 3]
+        matrix = np.array(entry["placement"])
+        mesh = [store.read(f"fields/{entry['field']}/mesh/{part}") for part in ("position", "normal", "face")]
+        body = make_body(*mesh, False, np.ones((len(mesh[0]), 3)), Material("any"), 1)
+        point = body.point @ matrix[:3, :3].T + matrix[:3, 3]
         np.testing.assert_allclose(position[rows], point, atol=1e-12, err_msg=name)
         vertex = store.read("receivers/vertex")[rows]
         np.testing.assert_allclose(store.read("mesh/position")[vertex], point, atol=1e-9)
@@ -112,6 +127,34 @@ def test_static_receivers_do_not_see_what_moves(scene, store, tmp_path):
     assert "fields" not in together.attrs
 
 
+def test_inspect_says_how_large_fields_are_and_how_far_off(store):
+    found = inspect(store.path, verify=True)
+    assert found["problems"] == []
+    assert [f["objects"] for f in found["fields"]] == [["again", "ball"], ["block"]]
+    for k, entry in enumerate(found["fields"]):
+        assert entry["error"] == read_field(store, f"fields/{k}/").transfer.error
+        assert entry["tolerance"] == 0.01
+        assert entry["transfer_raw_bytes"] == 4 * 48 * 2 * 16 * 16 * (1, 3)[k]
+        own = [name for name in found["arrays"] if name.startswith(f"fields/{k}/")]
+        assert entry["bytes"] == sum(found["arrays"][name]["bytes"] for name in own) > entry["transfer_bytes"]
+    assert not any("/work/" in name for name in found["arrays"])
+
+
+def test_glossy_objects_keep_their_self_transfer(scene, tmp_path):
+    path = write(tmp_path)
+    text = path.read_text().replace(
+        "[materials.block]\n", "[materials.block]\nmodel = 'blinn-phong'\nshininess = 5\nspecular = [0.3, 0.3, 0.3]\n"
+    )
+    path.write_text(text)
+    made = formats.open_store(make_store(path, **SMALL))
+    body = find_movers(load_scene(path), FieldSettings(2, 2, 2), False, 0).fields[1].body
+    _, own = build_field(Tracer(body.positions, body.faces), body, 2, 2, 2, tolerance=0.01)
+    whole = own.transfer.sum(axis=1)
+    field = read_field(made, "fields/1/")
+    assert np.linalg.norm(field.self_whole - whole) <= 0.0101 * np.linalg.norm(whole)  # half the transfer's tolerance
+    assert field.transfer.error <= 0.0202
+
+
 def test_lights_have_source_fields(store):
     source = read_source(store, "sources/0/")
     assert (source.radius, source.resolution) == (0.2, 2)
@@ -123,8 +166,8 @@ def test_the_same_bytes_for_workers_interruptions_and_libraries(scene, store, tm
     two = make_store(scene, "two.zarr", **SMALL, bounces=1, workers=2)
     assert formats.open_store(two).fingerprint == store.fingerprint
 
-    monkeypatch.setattr(field_store.FieldSpec, "block", property(lambda spec: 7))
-    original, left = field_store.SampleWorker.run, [3]
+    monkeypatch.setattr(field_job.FieldSpec, "block", property(lambda spec: 7))
+    original, left = field_job.SampleWorker.run, [3]
 
     def stopping(worker, block):
         if left[0] == 0:
@@ -133,16 +176,28 @@ def test_the_same_bytes_for_workers_interruptions_and_libraries(scene, store, tm
         return original(worker, block)
 
     with monkeypatch.context() as patch:
-        patch.setattr(field_store.SampleWorker, "run", stopping)
+        patch.setattr(field_job.SampleWorker, "run", stopping)
         with pytest.raises(KeyboardInterrupt):
             make_store(scene, "resumed.zarr", **SMALL, bounces=1)
     run.close_worker()
     traced = []
-    monkeypatch.setattr(field_store.SelfWorker, "run", lambda worker, block: traced.append(block))
+    monkeypatch.setattr(field_job.SelfWorker, "run", lambda worker, block: traced.append(block))
     resumed = formats.open_store(make_store(scene, "resumed.zarr", **SMALL, bounces=1))
     assert not traced  # the self transfer was there
-    for name in ("transfer", "occlusion", "valid"):
+    for name in ("transfer/component", "transfer/coefficient", "hidden", "valid", "self"):
         np.testing.assert_array_equal(resumed.read(f"fields/1/{name}"), store.read(f"fields/1/{name}"))
+
+
+def test_a_crash_before_the_work_is_cleared_leaves_nothing_behind(scene, store, monkeypatch):
+    def dying(writer, name):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(formats.Writer, "drop", dying)
+        with pytest.raises(KeyboardInterrupt):
+            make_store(scene, "cleared.zarr", **SMALL, bounces=1)
+    assert (scene.parent / "cleared.zarr.partial/fields/0/work").is_dir()
+    assert formats.open_store(make_store(scene, "cleared.zarr", **SMALL, bounces=1)).fingerprint == store.fingerprint
 
 
 def test_a_library_is_filled_once_and_used_by_other_scenes(scene, store, tmp_path, monkeypatch):
@@ -150,18 +205,20 @@ def test_a_library_is_filled_once_and_used_by_other_scenes(scene, store, tmp_pat
     kept = formats.open_store(make_store(scene, "kept.zarr", **SMALL, bounces=1, field_library=library))
     assert kept.fingerprint == store.fingerprint
     assert len(list(library.glob("*.zarr"))) == 2
-    field, _ = read_field(formats.open_store(sorted(library.glob("*.zarr"))[0], "field"))
-    assert field.transfer.shape[:3] == (2, 24, 2)
+    field = read_field(formats.open_store(sorted(library.glob("*.zarr"))[0], "field"))
+    assert field.transfer.decompress().shape[:2] == (2 * 24, 2)
 
     def refuse(worker, block):
         raise AssertionError("simulated again")
 
-    monkeypatch.setattr(field_store.SampleWorker, "run", refuse)
-    monkeypatch.setattr(field_store.SelfWorker, "run", refuse)
+    monkeypatch.setattr(field_job.SampleWorker, "run", refuse)
+    monkeypatch.setattr(field_job.SelfWorker, "run", refuse)
     other = write(tmp_path / "other")
     other.write_text(other.read_text().replace("translate = [0, 0.6, 0]", "translate = [0, 0.9, 0.3]"))
     again = formats.open_store(make_store(other, **SMALL, field_library=library))
-    np.testing.assert_array_equal(again.read("fields/0/transfer"), store.read("fields/0/transfer"))
+    for name in ("component", "coefficient"):
+        found, wanted = (s.read(f"fields/0/transfer/{name}") for s in (again, store))
+        np.testing.assert_array_equal(found, wanted)
 
 
 def test_own_frames_leave_place_rotation_and_size_to_the_placement():
@@ -185,6 +242,7 @@ def test_own_frames_leave_place_rotation_and_size_to_the_placement():
         ({"field_resolution": 0}, "--field-resolution: expected 1 to 128; found 0"),
         ({"field_resolution": 129}, "--field-resolution: expected 1 to 128; found 129"),
         ({"field_proxies": 0}, "--field-proxies: expected 1 to 256; found 0"),
+        ({"field_tolerance": 0.0}, "--field-tolerance: expected 0.001 to 0.5; found 0.0"),
         ({"field_order": 9}, "--field-order: expected 1 to 8; found 9"),
         ({"receivers": "pixels:main"}, "--receivers: objects that move"),
     ],

@@ -234,15 +234,26 @@ def test_sizes_may_change(store):
     assert found[""] <= WHOLE
 
 
-def test_materials_of_what_moves_stay(tmp_path, library):
+def test_the_diffuse_colour_of_what_moves_may_change(tmp_path, library):
+    """As if the scene file had said so, for a block and a ball that do not see themselves: direct light to round-off,
+    and what follows within the errors of the two compressed transfers."""
     path = write(tmp_path)
     path.write_text(path.read_text().replace("adjustable = false", "adjustable = true"))
-    made = make_store(path, **SMALL, bounces=0, field_library=library)
-    with pytest.raises(InputError, match=r"--set ball: is the material of 'ball', which moves"):
-        picture(made, env="smooth", settings=("ball.diffuse=0.1,0.1,0.1",))
-    dark, _ = picture(made, env="smooth", settings=("ground.diffuse=0,0,0",))
-    lit, _ = picture(made, env="smooth")
-    assert dark.sum() < lit.sum()
+    made = make_store(path, **SMALL, bounces=2, field_library=library)
+    colour = (0.2, 0.5, 0.9)
+    settings = tuple(f"{name}.diffuse={colour[0]},{colour[1]},{colour[2]}" for name in ("ball", "block"))
+    moves = ("ball=0.1,0.5,0.4", "block=-0.8,0.5,0,0,20,0")
+    before = layers(made, "before", moves)["direct"]
+    ours = layers(made, "ours", moves, settings=settings)
+    assert np.abs(before - ours["direct"]).max() > 0.1
+    text = path.read_text().replace("adjustable = true", "adjustable = false")  # and simulated for this colour alone
+    path.write_text(text.replace("diffuse = [0.7, 0.7, 0.7]", f"diffuse = {list(colour)}"))
+    anew = layers(make_store(path, "anew.zarr", **SMALL, bounces=2, field_library=library), "anew", moves)
+    for name in ("direct", "one_bounce", "two_bounce"):
+        missing = np.sqrt(((ours[name] - anew[name]) ** 2).mean() / (anew[name] ** 2).mean())
+        assert missing < (1e-5 if name == "direct" else 0.01), name
+    with pytest.raises(InputError, match=r"--set ball: is the material of 'ball', which moves: .* only the diffuse"):
+        picture(made, env="smooth", settings=("ball=brass",))
 
 
 def test_stores_without_fields_move_nothing(tmp_path):

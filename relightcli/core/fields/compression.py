@@ -1,21 +1,26 @@
 """Radiance transfer fields in clusters of their own principal components. [Pan 2007, Eqs. 9 and 12]
 
-A sample's transfer to all proxies is one row of m N N C numbers; in its cluster h
+A sample's transfer to all proxies is one row of D = m N N C numbers; in its cluster h
 
     M(r)  ~  E_h0 + sum over j of alpha_j(r) E_hj,
 
 E_h0 the cluster's mean (which Eq. 9 lacks: the method it cites is affine). Reflected light is made in this form: first
 E_hj L for the light at the proxies, once for all samples of a cluster, then the sum over j of every sample.
 
-The clusters are found in the leading coordinates of one common basis that leaves less than a tenth of the tolerance:
-distances stay nearly what they are, and D (2,000 and more) falls to hundreds. Terms are given out where they pay most
-for their bytes, until the tolerance is met. Components are 8-bit integers with a scale for each; those whose rounding
-would show have a second 8 bits, of what the first leave. Coefficients are 16-bit integers.
+The clusters are found in the leading coordinates of one common basis that leaves a small part of the error that is
+allowed: distances stay nearly what they are, and D (2,000 and more) falls to hundreds. Terms are given out where they
+pay most for their bytes, until the tolerance is met.
+
+Rounding takes a share of the error on purpose, where it costs least. With orthonormal components every coefficient
+errs alike in the sum, so all have the same step. A component's error counts as often as it is used, so its step goes
+with 1 / sqrt(its energy in all samples): most numbers are a few bits long, which a store's entropy coder makes use of.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -27,52 +32,37 @@ from relightcli.errors import NumericalError
 
 CLUSTERS = 32
 TERMS = 16
-MOST_COMMON = 384  # directions of the common basis
+COMMON = 512  # directions of the common basis to begin with
 MOST_TOLD_APART = 64  # leading ones of them that clusters are found by
-_STEPS, _COEFFICIENT_STEPS = 127, 32767
-_FINER = np.float32(254.0)  # half a step is 127 of these
-_ROUNDING = 0.1  # share of the error that rounding may have, in squares
-_FLOOR = 1e-4  # of the norm: far below what a few bits of components leave
+_MOST = 32767  # in 16 bits
+_OF_BASIS, _OF_COEFFICIENTS, _OF_COMPONENTS = 0.6, 0.2, 0.1  # shares of the error allowed, in squares, at most
+_ENOUGH = 0.01  # of it: a common basis that leaves this is large enough
+_COMPONENT_BYTES, _COEFFICIENT_BYTES = 0.75, 0.5  # of a number, about, after the entropy coder
+_FLOOR = 1e-4  # relative error below which nothing is allowed for: 16 bits do not carry it
+_SLAB = 4096  # samples at a time
 
 
 @dataclass(frozen=True)
 class CompressedTransfer:
     """Transfer of all samples of a field; see `Transfer` of `fields.entities`.
 
-    shape m, N, N, C of a sample; cluster (samples,) uint8 or int32
+    shape m, N, N, C of a sample; cluster (samples,) uint8
     start (K + 1,) int32: components of cluster h are start[h] to start[h + 1], the mean first
-    component (E, m N N C) int8 and its scale (E,) float32; finer (G, m N N C) int8 in steps of 1/254 of the scale, to
-    be added to the components refined (G,) int32
-    first (samples + 1,) int64: a sample's coefficients, all but the mean's, in coefficient (A,) int16; their scale is
-    that of the component, coefficient_scale (E,) float32
-    error: |M - M~| / |M|, Frobenius, over all samples, quantisation included
+    component (E, m N N C) int16, or float32 (see `albedos`), to be multiplied by scale (E,) float32
+    coefficient (A,) int16, to be multiplied by coefficient_scale (E,) float32 of its component: those of a sample, all
+    but the mean's, lie together; first (samples + 1,) int64: where
+    error: |M - M~| / |M|, Frobenius, over all samples, rounding included
     """
 
     shape: tuple[int, int, int, int]
-    cluster: NDArray[np.int32]
+    cluster: NDArray[np.uint8]
     start: NDArray[np.int32]
-    component: NDArray[np.int8]
+    component: NDArray[Any]
     scale: NDArray[np.float32]
-    finer: NDArray[np.int8]
-    refined: NDArray[np.int32]
-    first: NDArray[np.int64]
     coefficient: NDArray[np.int16]
     coefficient_scale: NDArray[np.float32]
     error: float
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes kept: a cluster's number takes one, the places of coefficients follow from it."""
-        arrays = (
-            self.start,
-            self.component,
-            self.scale,
-            self.finer,
-            self.refined,
-            self.coefficient,
-            self.coefficient_scale,
-        )
-        return sum(a.nbytes for a in arrays) + len(self.cluster)
+    first: NDArray[np.int64]
 
     def reflect(self, light: NDArray[np.floating], which: NDArray[np.integer]) -> NDArray[np.float32]:
         """Radiance (k, 3, N) float32 of the object seen from samples `which` (k,), light (m, 3, N) at its proxies."""
@@ -80,12 +70,9 @@ class CompressedTransfer:
         used = np.bincount(self.cluster[which], minlength=len(self.start) - 1) > 0
         rows = np.flatnonzero(np.repeat(used, np.diff(self.start)))
         # (m, N in, C) against (E, m, N out, N in, C), by the components of clusters that are read alone
-        seen = np.zeros((len(self.component), 3, n), np.float32)
+        seen = np.empty((len(self.component), 3, n), np.float32)
         light = np.ascontiguousarray(light, np.float32)
-        shape = m, n, n, colours
-        _apply(self.component.reshape(-1, *shape), self.scale, light, rows, rows, seen)
-        fine = np.flatnonzero(np.isin(self.refined, rows))
-        _apply(self.finer.reshape(-1, *shape), self.scale / _FINER, light, fine, self.refined[fine], seen)
+        _apply(self.component.reshape(-1, m, n, n, colours), self.scale, light, rows, seen)
         out = np.empty((len(which), 3, n), np.float32)
         _combine(
             which, self.cluster, self.start, self.first, self.coefficient, self.coefficient_scale,
@@ -93,119 +80,166 @@ class CompressedTransfer:
         )  # fmt: skip
         return out
 
-    def decompress(self) -> NDArray[np.float32]:
-        """The transfer (samples, m, N, N, C) float32."""
-        rows = np.empty((len(self.cluster), self.component.shape[1]), np.float32)
-        for h in range(len(self.start) - 1):
-            own = np.flatnonzero(self.cluster == h)
+    def decompress(self, start: int = 0, stop: int | None = None) -> NDArray[np.float32]:
+        """The transfer (samples, m, N, N, C) float32 of the samples start .. stop."""
+        cluster = self.cluster[start:stop]
+        rows = np.empty((len(cluster), self.component.shape[1]), np.float32)
+        for h in np.unique(cluster):
+            own = np.flatnonzero(cluster == h)
             a, b = self.start[h], self.start[h + 1]
             basis = self.component[a:b] * self.scale[a:b, None]
-            fine = np.flatnonzero((self.refined >= a) & (self.refined < b))
-            basis[self.refined[fine] - a] += self.finer[fine] * (self.scale[self.refined[fine], None] / _FINER)
-            places = self.first[own, None] + np.arange(b - a - 1)
-            alpha = self.coefficient[places] * self.coefficient_scale[a + 1 : b]
-            rows[own] = basis[0] + alpha @ basis[1:]
+            places = self.first[start + own, None] + np.arange(b - a - 1)
+            rows[own] = basis[0] + (self.coefficient[places] * self.coefficient_scale[a + 1 : b]) @ basis[1:]
         return rows.reshape(-1, *self.shape)
 
 
+def places_of(cluster: NDArray[np.uint8], start: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Where the coefficients of every sample begin, (samples + 1,) int64; `CompressedTransfer.first`."""
+    first = np.zeros(len(cluster) + 1, np.int64)
+    np.cumsum((np.diff(start) - 1)[cluster], out=first[1:])
+    return first
+
+
 def compress(
-    transfer: NDArray[np.float32],
+    transfer: NDArray[np.float32] | Sequence[NDArray[np.float32]],
     clusters: int = CLUSTERS,
     terms: int = TERMS,
     tolerance: float | None = None,
     seed: int = 0,
 ) -> CompressedTransfer:
-    """Compresses a transfer (samples, m, N, N, C).
+    """Compresses a transfer (samples, m, N, N, C), or a sequence of such that follow each other; these are read several
+    times, one at a time.
 
-    terms: components of every cluster, the mean counted; tolerance: relative error in the Frobenius norm instead, with
-    as many components in all as it takes, within a common basis of MOST_COMMON directions. Raises NumericalError for
-    values that are not finite.
+    clusters: at most 256; terms: components of every cluster, the mean counted; tolerance: relative error in the
+    Frobenius norm instead, with as many components in all as it takes. Raises NumericalError for values that are not
+    finite. The bytes may depend on the number of threads of NumPy's linear algebra.
     """
-    shape = transfer.shape[1:]
-    rows = transfer.reshape(len(transfer), -1)
-    norm2 = float(np.einsum("ij,ij->", rows, rows, dtype=np.float64))
+    if isinstance(transfer, np.ndarray):
+        transfer = [transfer[a : a + _SLAB] for a in range(0, len(transfer), _SLAB)]
+    rows = _Rows(transfer)
+    mean, norm2 = rows.mean()
     if not np.isfinite(norm2):
         raise NumericalError("compression of a transfer field: values that are not finite")
-    goal2 = (0.0 if tolerance is None else tolerance) ** 2 * norm2
-    rng = np.random.default_rng(seed)
-    origin, basis, x, left2 = _common_basis(rows, max(goal2 / 100.0, _FLOOR**2 * norm2), rng)
+    goal2 = None if tolerance is None else max(tolerance, _FLOOR) ** 2 * norm2
+    # By terms, the common basis is as it is, and what it leaves counts as theirs.
+    enough, most = (_FLOOR**2 * norm2, np.inf) if goal2 is None else (_ENOUGH * goal2, _OF_BASIS * goal2)
+    basis, x, left2 = _common_basis(rows, mean, enough, most, seed)
     label = cpca(x[:, :MOST_TOLD_APART], clusters, max(1, terms - 1), seed).label
-    count = int(label.max()) + 1
-    means, vectors, gains = [], [], []
-    for h in range(count):
-        own = x[label == h]
-        mean = own.mean(0)
-        spectrum, directions = gram_spectrum((own - mean).T @ (own - mean))
-        most = min(len(own) - 1, len(spectrum))
-        means.append(mean)
-        vectors.append(directions[:, :most])
-        gains.append(np.maximum(spectrum[:most], 0.0))
-    kept = [min(terms - 1, len(g)) for g in gains]
-    if tolerance is not None:
-        sizes = np.bincount(label)
-        bytes_ = [rows.shape[1] + 8.0 + 2.0 * size for size in sizes]
-        kept = _share_out(gains, bytes_, (1.0 - _ROUNDING) * goal2 - left2)
-    start = np.zeros(count + 1, np.int32)
+    spaces = [_subspace(x[label == h]) for h in range(int(label.max()) + 1)]
+    sizes = np.bincount(label)
+    kept = [min(terms - 1, len(s.gain)) for s in spaces]
+    if goal2 is not None:
+        bytes_ = _COMPONENT_BYTES * rows.width + _COEFFICIENT_BYTES * sizes
+        rounding = _OF_COEFFICIENTS + _OF_COMPONENTS
+        kept = _share_out([s.gain for s in spaces], bytes_.tolist(), (1.0 - rounding) * goal2 - left2)
+    else:
+        goal2 = max(left2 + sum(float(s.gain[k:].sum()) for s, k in zip(spaces, kept, strict=True)), _FLOOR**2 * norm2)
+    start = np.zeros(len(spaces) + 1, np.int32)
     start[1:] = np.cumsum(np.array(kept) + 1)
-    alpha = [(x[label == h] - means[h]) @ vectors[h][:, : kept[h]] for h in range(count)]
-    first = np.concatenate([[0], np.cumsum(np.array(kept)[label])]).astype(np.int64)
-    component = np.empty((start[-1], rows.shape[1]), np.int8)
-    scale, coefficient_scale = np.empty(start[-1], np.float32), np.ones(start[-1], np.float32)
+    cluster = label.astype(np.uint8)
+    first = places_of(cluster, start)
     coefficient = np.empty(first[-1], np.int16)
-    rest = np.empty((start[-1], rows.shape[1]), np.float32)  # what 8 bits leave of a component, in steps
-    shown = np.empty(start[-1])  # its square sum in all samples
-    for h in range(count):
+    component = np.empty((start[-1], rows.width), np.int16)
+    scale, coefficient_scale = np.empty(start[-1], np.float32), np.ones(start[-1], np.float32)
+    step = np.sqrt(12.0 * _OF_COEFFICIENTS * goal2 / max(1, first[-1]))
+    energy_step = np.sqrt(12.0 * _OF_COMPONENTS * goal2 / component.size)
+    for h, (space, count) in enumerate(zip(spaces, kept, strict=True)):
         a, b = start[h], start[h + 1]
-        full = np.concatenate([(origin + basis @ means[h])[None], (basis @ vectors[h][:, : kept[h]]).T])
-        integers, scale[a:b] = _quantise(full, _STEPS)
-        component[a:b] = integers
-        rest[a:b] = full / np.where(scale[a:b] > 0.0, scale[a:b], 1.0)[:, None] - integers
-        weight = np.concatenate([[float((label == h).sum())], gains[h][: kept[h]]])
-        shown[a:b] = weight * (rest[a:b] ** 2).sum(1) * scale[a:b].astype(np.float64) ** 2
-        integers, coefficient_scale[a + 1 : b] = _quantise(alpha[h].T, _COEFFICIENT_STEPS)
-        coefficient[first[:-1][label == h, None] + np.arange(kept[h])] = integers.T
-    left = left2 + sum(float(g[k:].sum()) for g, k in zip(gains, kept, strict=True))
-    refined = _worst(shown, _ROUNDING * (left if tolerance is None else goal2))
-    finer = np.clip(np.rint(rest[refined] * _FINER), -_STEPS, _STEPS).astype(np.int8)
-    made = CompressedTransfer(
-        shape, label, start, component, scale, finer, refined, first, coefficient, coefficient_scale, 0.0
-    )
-    missing = made.decompress().reshape(rows.shape) - rows
-    error2 = float(np.einsum("ij,ij->", missing, missing, dtype=np.float64))
-    return CompressedTransfer(**{**made.__dict__, "error": (error2 / norm2) ** 0.5 if norm2 > 0.0 else 0.0})
+        directions = space.directions[:, :count]
+        full = np.concatenate([(mean + basis @ space.mean)[None], (basis @ directions).T])
+        energy = np.concatenate([sizes[h : h + 1], space.gain[:count]])
+        component[a:b], scale[a:b] = _round(full, energy_step / np.sqrt(np.maximum(energy, 1e-300)))
+        alpha = ((x[label == h] - space.mean) @ directions).T
+        rounded, coefficient_scale[a + 1 : b] = _round(alpha, np.full(count, step))
+        coefficient[first[:-1][label == h, None] + np.arange(count)] = rounded.T
+    made = CompressedTransfer(rows.shape, cluster, start, component, scale, coefficient, coefficient_scale, 0.0, first)
+    return replace(made, error=rows.error(made, norm2))
+
+
+class _Rows:
+    """The samples as rows of numbers, read slab by slab."""
+
+    def __init__(self, slabs: Sequence[NDArray[np.float32]]) -> None:
+        self.slabs = slabs
+        self.shape: tuple[int, int, int, int] = slabs[0].shape[1:]
+        self.width = int(np.prod(self.shape))
+
+    def mean(self) -> tuple[NDArray[np.float32], float]:
+        """The mean row (D,) and the sum of all squares."""
+        total, count, norm2 = np.zeros(self.width), 0, 0.0
+        for slab in self.slabs:
+            rows = slab.reshape(len(slab), -1)
+            total += rows.sum(0, dtype=np.float64)
+            norm2 += float(np.einsum("ij,ij->", rows, rows, dtype=np.float64))
+            count += len(rows)
+        return (total / count).astype(np.float32), norm2
+
+    def about(self, mean: NDArray[np.float32]) -> Iterator[NDArray[np.float32]]:
+        """Slabs of the rows less the mean."""
+        for slab in self.slabs:
+            yield slab.reshape(len(slab), -1) - mean
+
+    def error(self, made: CompressedTransfer, norm2: float) -> float:
+        """Relative error of what was made."""
+        start, error2 = 0, 0.0
+        for slab in self.slabs:
+            missing = made.decompress(start, start + len(slab)) - slab
+            error2 += float(np.einsum("i,i->", missing.ravel(), missing.ravel(), dtype=np.float64))
+            start += len(slab)
+        return (error2 / norm2) ** 0.5 if norm2 > 0.0 else 0.0
+
+
+@dataclass(frozen=True)
+class _Subspace:
+    """mean (R,) of a cluster's rows, orthonormal directions (R, r), and how much every one explains, (r,)."""
+
+    mean: NDArray[np.float64]
+    directions: NDArray[np.float64]
+    gain: NDArray[np.float64]
+
+
+def _subspace(own: NDArray[np.float32]) -> _Subspace:
+    x = own.astype(np.float64)
+    mean = x.mean(0)
+    x -= mean
+    spectrum, directions = gram_spectrum(x.T @ x)
+    most = min(len(own) - 1, len(spectrum))
+    return _Subspace(mean, directions[:, :most], np.maximum(spectrum[:most], 0.0))
 
 
 def _common_basis(
-    rows: NDArray[np.float32], allowed: float, rng: np.random.Generator
-) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64], float]:
-    """The rows' mean (D,), an orthonormal basis (D, R), the coordinates (n, R) in it, and the square sum that it
-    leaves: R as small as `allowed` says, at most MOST_COMMON.
+    rows: _Rows, mean: NDArray[np.float32], enough: float, most: float, seed: int
+) -> tuple[NDArray[np.float64], NDArray[np.float32], float]:
+    """An orthonormal basis (D, R), the coordinates (n, R) in it of the rows less their mean, and the square sum that it
+    leaves: as small as a basis that leaves `enough`, or COMMON, or as large as one that leaves at most `most`.
 
     By a random sketch of the rows with one power step: a Gram matrix of D = 6,000 would cost ten times as much.
     """
-    mean = rows.mean(0, dtype=np.float64).astype(np.float32)
-    size = min(MOST_COMMON, *rows.shape)
-    parts = [slice(a, a + 4096) for a in range(0, len(rows), 4096)]
-    sketch = np.zeros((rows.shape[1], size))
-    for part in parts:
-        own = rows[part] - mean
-        sketch += own.T @ rng.standard_normal((len(own), size), np.float32)
-    for _ in range(2):
-        basis, _ = np.linalg.qr(sketch)
-        sketch = np.zeros_like(sketch)
-        gram, total = np.zeros((size, size)), 0.0
-        coordinates = np.empty((len(rows), size))
-        for part in parts:
-            own = rows[part] - mean
-            along = own @ basis.astype(np.float32)
-            sketch += own.T @ along
-            coordinates[part] = along
-            gram += coordinates[part].T @ coordinates[part]
-            total += float(np.einsum("ij,ij->", own, own, dtype=np.float64))
-    spectrum, vectors = gram_spectrum(gram)
-    left = np.maximum(total - np.cumsum(spectrum), 0.0)
-    keep = vectors[:, : int((left > allowed).sum()) + 1]
-    return mean, basis @ keep, coordinates @ keep, float(left[keep.shape[1] - 1])
+    count = sum(len(slab) for slab in rows.slabs)
+    size = min(COMMON, rows.width, count)
+    while True:
+        rng = np.random.default_rng(seed)
+        sketch = np.zeros((rows.width, size))
+        for own in rows.about(mean):
+            sketch += own.T @ rng.standard_normal((len(own), size), np.float32)
+        coordinates = np.empty((count, size), np.float32)
+        for _ in range(2):
+            basis, _ = np.linalg.qr(sketch)
+            sketch, gram, total, start = np.zeros_like(sketch), np.zeros((size, size)), 0.0, 0
+            for own in rows.about(mean):
+                along = own @ basis.astype(np.float32)
+                sketch += own.T @ along
+                coordinates[start : start + len(own)] = along
+                gram += along.T.astype(np.float64) @ along
+                total += float(np.einsum("ij,ij->", own, own, dtype=np.float64))
+                start += len(own)
+        spectrum, vectors = gram_spectrum(gram)
+        left = np.maximum(total - np.cumsum(spectrum), 0.0)
+        if left[-1] <= most or size == min(rows.width, count):
+            break
+        size = min(2 * size, rows.width, count)
+    keep = vectors[:, : int((left > enough).sum()) + 1]
+    return basis @ keep, coordinates @ keep.astype(np.float32), float(left[keep.shape[1] - 1])
 
 
 def _share_out(gains: list[NDArray[np.float64]], bytes_: list[float], allowed: float) -> list[int]:
@@ -218,37 +252,31 @@ def _share_out(gains: list[NDArray[np.float64]], bytes_: list[float], allowed: f
     return np.bincount(owner[best[:enough]], minlength=len(gains)).tolist()
 
 
-def _worst(shown: NDArray[np.float64], allowed: float) -> NDArray[np.int32]:
-    """The fewest components, rising, without which the sum of `shown` is within what is allowed."""
-    order = np.argsort(-shown, kind="stable")
-    left = shown.sum() - np.concatenate([[0.0], np.cumsum(shown[order])])
-    return np.sort(order[: int((left > allowed).sum())]).astype(np.int32)
-
-
-def _quantise(rows: NDArray[np.float64], most: int) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Whole numbers (n, D) from -most to most, and scales (n,), of rows."""
-    scale = (np.abs(rows).max(1, initial=0.0) / most).astype(np.float32)
+def _round(rows: NDArray[np.float64], step: NDArray[np.float64]) -> tuple[NDArray[np.int16], NDArray[np.float32]]:
+    """Whole numbers (n, D) and scales (n,) of rows: steps (n,) as asked for, or what 16 bits reach to."""
+    peak = np.abs(rows).max(1, initial=0.0)
+    scale = np.clip(step, peak / _MOST, peak).astype(np.float32)
     steps = np.where(scale > 0.0, scale, 1.0).astype(np.float64)
-    return np.clip(np.rint(rows / steps[:, None]), -most, most), scale
+    return np.clip(np.rint(rows / steps[:, None]), -_MOST, _MOST).astype(np.int16), scale
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
-def _apply(component, scale, light, rows, at, out):  # type: ignore[no-untyped-def]
-    """Adds E L of components rows[r] (of (E, m, N, N, C)), of scale at[r], to out[at[r]] (3, N)."""
+def _apply(component, scale, light, rows, out):  # type: ignore[no-untyped-def]
+    """E L of components e = rows[r] (of (E, m, N, N, C)), of scale[e], into out[e] (3, N)."""
     colours = component.shape[4]
     for r in range(len(rows)):
-        e, to = rows[r], at[r]
-        for k in range(component.shape[1]):
-            for i in range(component.shape[2]):
-                for c in range(3):
-                    total = np.float32(0.0)
+        e = rows[r]
+        for i in range(component.shape[2]):
+            for c in range(3):
+                total = np.float32(0.0)
+                for k in range(component.shape[1]):
                     if colours == 1:
                         for j in range(component.shape[3]):
-                            total += component[e, k, i, j, 0] * light[k, c, j]
+                            total += np.float32(component[e, k, i, j, 0]) * light[k, c, j]
                     else:
                         for j in range(component.shape[3]):
-                            total += component[e, k, i, j, c] * light[k, c, j]
-                    out[to, c, i] += scale[to] * total
+                            total += np.float32(component[e, k, i, j, c]) * light[k, c, j]
+                out[e, c, i] = scale[e] * total
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})

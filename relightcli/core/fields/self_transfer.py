@@ -85,6 +85,14 @@ def exits_of(body: Body, transfer: NDArray[np.float32]) -> NDArray[np.float32]:
     return _exit(body, diffuse_operator(body), turn, np.ascontiguousarray(received))
 
 
+def diffuse_part(body: Body, transfer: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Diffuse exit radiance (P, N, C) of points of albedo 1 per light about the object: A_l y_i(n) / pi times the sum
+    over the proxies of a self transfer (P, m, N, N, C)."""
+    whole = transfer.sum(axis=1, dtype=np.float64)
+    out: NDArray[np.float64] = np.einsum("pi,pijc->pjc", diffuse_operator(body), whole)
+    return out
+
+
 def _exit(
     body: Body, operator: NDArray[np.float64], turn: NDArray[np.float64], received: NDArray[np.float32]
 ) -> NDArray[np.float32]:
