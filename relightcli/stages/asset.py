@@ -162,7 +162,7 @@ class AssetStore(LightingStore):
         rows = np.arange(len(tensors.lobed)) if active is None else np.flatnonzero(active[tensors.lobed])
         colours = table.parameters[:, SPECULAR_COLUMN : SPECULAR_COLUMN + 3]
         colour = np.where(shiny[:, None], colours, 0.0).astype(np.float32)
-        seen = view[tensors.lobed]
+        seen = np.take(view, tensors.lobed, axis=0)
         uniform = tensors.uniform if tensors.uniform is not None else np.zeros((len(seen), 3), np.float32)
         found: list[NDArray[np.float32]] = []
         for k, local in enumerate(tensors.local):
@@ -175,7 +175,7 @@ class AssetStore(LightingStore):
         out: list[NDArray[np.float32] | None] = []
         for part in found:
             whole = np.zeros((len(self), 3), np.float32)
-            whole[tensors.lobed] = np.maximum(part, 0.0)
+            _put(part, tensors.lobed, whole)
             out.append(whole)
         return out
 
@@ -227,7 +227,7 @@ class _Tensors:
         self._weights: NDArray[np.float64] | None = None
         self._one: NDArray[np.float32] | None = None
         self._two: NDArray[np.float32] | None = None
-        self._room: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
+        self._room: list[NDArray[np.float32]] = []
         some = fit_receivers(len(receiver))
         self._fit_bits, self._fit_normal = asset.bits_of(some), np.ascontiguousarray(asset.normal[some])
         self._fit = [
@@ -279,22 +279,30 @@ class _Tensors:
         flat = np.ascontiguousarray(values, np.float32).reshape(c, v, 3 * s)
         k = len(self.even)
         if len(self._room) == k:  # memory is taken once: fresh pages would cost more than filling them
-            self._room.append((np.empty((len(rows), 3), np.float32), np.empty((len(self.lobed), 3, s), np.float32)))
-        ordered, local = self._room[k]
+            self._room.append(np.empty((len(self.lobed), 3, s), np.float32))
+        local = self._room[k]
+        even = np.empty((len(rows), 3), np.float32)  # not taken from there: what was made of the old one is told by it
 
         def part(a: int, b: int) -> None:
             _spread(
-                a, b, rows, self.cluster, flat, self.even_weights, ordered, self.lobe_row, self.rotations, local
+                a, b, rows, self.cluster, flat, self.even_weights, self.receiver, even,
+                self.lobe_row, self.rotations, local,
             )  # fmt: skip
 
         in_parts(part, len(rows), self.asset.threads)
-        even = np.empty_like(ordered)
-        even[self.receiver] = ordered
         self.even.append(even)
         if s == 1:
             self.uniform = local[:, :, 0]
         else:
             self.local.append(local)
+
+
+@njit(cache=True, nogil=True)
+def _put(values, rows, out):  # type: ignore[no-untyped-def]
+    """Values (n, 3), not below 0, at the rows (n,) of out."""
+    for j in range(len(rows)):
+        for c in range(3):
+            out[rows[j], c] = max(values[j, c], np.float32(0.0))
 
 
 LOBED = ("blinn-phong", "cook-torrance", "phong")
@@ -312,7 +320,7 @@ def _factors(store: formats.Store, name: str) -> Factors:
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
-def _spread(first, last, rows, cluster, flat, even_weights, even, lobe_row, rotations, local):  # type: ignore[no-untyped-def]
+def _spread(first, last, rows, cluster, flat, even_weights, receiver, even, lobe_row, rotations, local):  # type: ignore[no-untyped-def]
     size = flat.shape[2]
     count = size // 3
     world = np.empty(size, np.float32)
@@ -337,7 +345,7 @@ def _spread(first, last, rows, cluster, flat, even_weights, even, lobe_row, rota
                 total = zero
                 for k in range(count):
                     total += even_weights[i, k] * light[k]
-            even[i, colour] = max(total, zero)
+            even[receiver[i], colour] = max(total, zero)
             if row >= 0:
                 target = local[row, colour]
                 if count == 1:

@@ -108,6 +108,9 @@ class DirectTensors:
         store = lighting.store
         names = (*FAMILIES, MATTE)
         self.groups = [_Group(lighting, name) for name in names if f"direct/{name}/receiver" in store]
+        self.known = np.zeros(len(lighting), bool)  # receivers with tensors of their lobes
+        for group in self.groups:
+            self.known[group.receiver] = group.name != MATTE
         self.even = np.zeros((len(lighting), 3), np.float32)
         self.bright: Bright
 
@@ -134,12 +137,10 @@ class DirectTensors:
         receivers have one from here, (N,)."""
         out = np.zeros((len(self.lighting), 3), np.float32)
         wide = widen(table, 0.5 * np.pi / self.lighting.resolution)
-        known = np.zeros(len(self.lighting), bool)
         for group in self.groups:
             if group.name != MATTE:
                 out[group.receiver] = group.specular(table, wide, self.bright, view, active, self.lighting.threads)
-                known[group.receiver] = True
-        return out, known
+        return out, self.known
 
 
 class _Group:
@@ -177,7 +178,7 @@ class _Group:
         active: NDArray[np.bool_] | None,
         threads: int,
     ) -> NDArray[np.float32]:
-        towards = view[self.receiver]
+        towards = np.take(view, self.receiver, axis=0)
         black = np.zeros(3, np.float32)
         if active is not None:
             self.out[:] = 0.0
