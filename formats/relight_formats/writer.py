@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import zarr
 
 _GROUP = dump({"zarr_format": 3, "node_type": "group", "attributes": {}})
+_DROPPED = "dropped "  # in the notes of documents, before the name of an array that only the work needed
 _START_AGAIN = "Start again with --overwrite."
 
 
@@ -220,6 +221,8 @@ class Writer:
         self._need_open()
         check_name(name)
         for own in [other for other in self._layouts if f"{other}/".startswith(f"{name}/")]:
+            if _DROPPED + own not in self._documents.ids:  # noted first: it is not missing when it is gone
+                self._documents.append({"id": _DROPPED + own})
             del self._layouts[own]
             self._synced.pop(own, None)
         folder = self.partial_path / name
@@ -281,7 +284,9 @@ class Writer:
         self._sync_folders()
         self._header = {**self._header, "summary": plain(summary, "summary")}
         try:
-            lost = sorted({note["id"] for note in self._documents.blocks} - self._layouts.keys())
+            noted = self._documents.ids.keys()
+            dropped = {note.removeprefix(_DROPPED) for note in noted if note.startswith(_DROPPED)}
+            lost = sorted(note for note in noted - self._layouts.keys() - dropped if not note.startswith(_DROPPED))
             if lost:
                 raise StoreError(
                     f"{self.partial_path}: array {lost[0]}: its {ROOT}, which an interrupted run wrote, is missing. "

@@ -139,6 +139,8 @@ class Runs:
 
     def sums(self, values: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.float64]:
         """Of some cells."""
+        if len(cells) == 0:
+            return values[:0]
         if len(cells) > MANY:
             return self.sum(values)[cells]
         last = np.append(self.first, len(values))
@@ -230,7 +232,10 @@ class _ClusteredSky:
 
     def seen(self) -> NDArray[np.bool_]:
         """Who sees the points, (K, N)."""
-        return np.stack([self.sees(direction) for direction in self.points.direction])
+        found = np.zeros((len(self.points.direction), len(self.lighting)), bool)
+        for row, direction in zip(found, self.points.direction, strict=True):
+            row[:] = self.sees(direction)
+        return found
 
     def sees(self, direction: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Receivers that see a direction, (N,): rays where its cluster is seen in part."""

@@ -203,7 +203,7 @@ class Trial(LightingStore):
         self.side, self.vertex = points.side, points.vertex
         self.resolution, self.basis, self.bounces, self.pixels = resolution, "visibility", 0, 0
         self._buried = buried
-        self._coated = None
+        self._coated, self._cubes = None, []
         lamps = pack_lights(scene.lights.values())
         lit: dict[str, Any] = {}
         if lamps.number:

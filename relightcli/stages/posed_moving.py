@@ -47,7 +47,8 @@ class PosedMovingStore(MovingStore, PoseStore):
         # What hangs on where characters are, and is kept from move to move.
         self._standing = self.geometry.positions
         self._still, self._sites = Tracer(self._standing, self._faces), Sites(self.movers)
-        self._bits_of_lights, self._terms, self._undimmed, self._placed = {}, None, None, None
+        self._bits_of_lights, self._terms, self._undimmed = {}, None, None
+        self._placed = self._cosines = None
         if self._suns is not None:
             self.trace_suns()
         return notes

@@ -175,7 +175,7 @@ def test_workers_get_the_arrays_that_were_made_and_no_others(tmp_path: Path) -> 
             worker_array(writer.partial_path, "../a")
 
 
-def test_what_only_the_work_needs_is_dropped(tmp_path: Path) -> None:
+def test_what_only_the_work_needs_is_dropped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also after a crash halfway through, of which a group with some of its files is left."""
     with new(tmp_path / "store") as writer:
         for name in ("f/work/a", "f/work/b", "f/works", "f/kept"):
@@ -183,7 +183,15 @@ def test_what_only_the_work_needs_is_dropped(tmp_path: Path) -> None:
         writer.record("made", {})
         writer.drop("f/work/b")
         assert sorted(writer.layouts) == ["f/kept", "f/work/a", "f/works"]
-        (writer.partial_path / "f/work/a/zarr.json").unlink()
+
+        def crash(folder: Path) -> None:
+            (folder / "a/zarr.json").unlink()
+            raise OSError(5, "crash")
+
+        with monkeypatch.context() as patched:
+            patched.setattr("relight_formats.writer.remove_store", crash)
+            with pytest.raises(OSError, match="crash"):
+                writer.drop("f/work")
     again = begin(tmp_path / "store", "test", settings={}, inputs={}, program="test 1")
     assert again is not None
     with again as writer:

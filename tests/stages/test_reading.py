@@ -32,9 +32,9 @@ def reads(monkeypatch):
     count: collections.Counter[str] = collections.Counter()
     checked = chunks._checked_chunk
 
-    def counted(root, key):
+    def counted(root, key, expected):
         count[key] += 1
-        return checked(root, key)
+        return checked(root, key, expected)
 
     monkeypatch.setattr(chunks, "_checked_chunk", counted)
     return count
