@@ -96,10 +96,7 @@ class ClusteredStore(LightingStore):
         if shines and baked and self._lobes is None:
             self._lobes = _BakedLobes(self, sky.tree)
         sky.set_light(environment, rotate)
-        total = sky.irradiance
-        if len(sky.points.flux):
-            total += sky.of_points()
-        e = total.astype(np.float32)
+        e = sky.lit()
         lamp_e, lamps = self._lamps(coats, view, active)
         if lamp_e is not None:
             e += lamp_e
@@ -225,6 +222,10 @@ class _ClusteredSky:
         if self._splitter is None or self._splitter[0] != key:
             self._splitter = (key, Splitter(self.tree, *key))
         return self._splitter[1]
+
+    def lit(self) -> NDArray[np.float32]:
+        """Irradiance (N, 3) of all."""
+        return self.fractions.rounded(self._groups, self.of_points() if len(self.points.flux) else None)
 
     def of_points(self) -> NDArray[np.float64]:
         """Irradiance (N, 3) of the points."""

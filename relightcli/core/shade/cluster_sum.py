@@ -96,6 +96,12 @@ class Fractions:
         """(N, 3) of values by groups, (G, 3, 64)."""
         return np.ascontiguousarray(groups.transpose(0, 2, 1)).reshape(-1, 3)[: self.count]
 
+    def rounded(self, groups: NDArray[np.float64], more: NDArray[np.float64] | None) -> NDArray[np.float32]:
+        """(N, 3) float32 of values by groups plus `more` (N, 3)."""
+        out = np.empty((self.count, 3), np.float32)
+        _round(groups, np.zeros((0, 3)) if more is None else more, out)
+        return out
+
     def by_group(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """(G, 3, 64) of values (N, 3)."""
         padded = np.zeros((len(self.place) * GROUP, 3))
@@ -162,6 +168,16 @@ def _keep(column, place, mixed, first):  # type: ignore[no-untyped-def]
                     mixed[count, i - g * GROUP] = column[k, i]
                 place[g, k] = first + count
                 count += 1
+
+
+@njit(cache=True, nogil=True)
+def _round(groups, more, out):  # type: ignore[no-untyped-def]
+    for i in range(len(out)):
+        for c in range(3):
+            value = groups[i // GROUP, c, i % GROUP]
+            if len(more):
+                value += more[i, c]
+            out[i, c] = np.float32(value)
 
 
 @njit(cache=True, nogil=True, inline="always", error_model="numpy")
