@@ -36,12 +36,12 @@ from relightcli.core.fields.standing import (
     light_from_surfaces,
     sky_cells,
 )
-from relightcli.core.fields.suns import sun_light
 from relightcli.core.lights.environment import SkyCube, splat
 from relightcli.core.shade.bounces import Exit
 from relightcli.core.shade.gather import Gather
 from relightcli.core.shade.lobe_factors import LobeFactors
 from relightcli.core.shade.low_order import response, shade_low_order
+from relightcli.core.shade.seen_points import point_irradiance, point_lobes
 from relightcli.core.sphere import sh
 from relightcli.core.transport.light_visibility import light_bits
 from relightcli.core.transport.local_lights import LocalLights, pack_lights
@@ -305,9 +305,15 @@ class MovingStore(LightingStore):
         """Exit radiance of all receivers in the light of the suns."""
         placed = self._where()
         seen = suns.seen(self.movers, placed.entities, self.position, self.normal, self.threads)
-        e, s = sun_light(seen, suns.points, self.normal, view, coats.material, coats.table, self.threads)
-        colour = coats.table.parameters[coats.material][:, SPECULAR : SPECULAR + 3].astype(np.float32)
-        return Radiance(coats.diffuse(e), np.where(coats.shiny[:, None], s * colour, np.float32(0.0)))
+        by_point = np.ascontiguousarray(seen.T)
+        e = point_irradiance(by_point, suns.points, self.normal, self.threads).astype(np.float32)
+        specular = np.zeros_like(e)
+        if view is not None:
+            rows = np.flatnonzero(coats.shiny)
+            s = point_lobes(by_point, suns.points, self.normal, view, rows, coats.material, coats.table, self.threads)
+            colour = coats.table.parameters[:, SPECULAR : SPECULAR + 3].astype(np.float32)
+            specular[rows] = s.astype(np.float32) * colour[coats.material[rows]]
+        return Radiance(coats.diffuse(e), specular)
 
     def _add_sunlight(self, out: Radiance, rows: slice | NDArray[np.int64]) -> None:
         if self._sunlight is None:

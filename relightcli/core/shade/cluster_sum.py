@@ -194,7 +194,9 @@ def _add_all(place, mixed, normal, clusters, light, alike, mean, flux, radius, o
     for g in range(len(place)):
         nothing = True
         for j in range(len(clusters)):
-            nothing &= place[g, clusters[j]] == NONE
+            if place[g, clusters[j]] != NONE:
+                nothing = False
+                break
         if nothing:
             continue
         whole[:] = 0.0
