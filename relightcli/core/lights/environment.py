@@ -54,7 +54,7 @@ def latlong_to_cube(radiance: NDArray[np.float32], resolution: int, rotate_degre
     # Pixel columns by rising longitude: column W-1-k spans [-pi + k w, -pi + (k+1) w] + turn.
     columns = -math.pi + (2.0 * math.pi / width) * np.arange(width) + turn
     columns = np.mod(columns + math.pi, 2.0 * math.pi) - math.pi
-    borders = np.unique(np.concatenate([columns, _strip_meridians(resolution), [-math.pi, math.pi]]))
+    borders = np.unique(np.concatenate([columns, *_strip_meridians(resolution, width), [-math.pi, math.pi]]))
     middle = 0.5 * (borders[1:] + borders[:-1])
     k = np.floor(np.mod(middle - turn + math.pi, 2.0 * math.pi) * (width / (2.0 * math.pi))).astype(np.int64)
     column_of = width - 1 - np.clip(k, 0, width - 1)
@@ -80,9 +80,9 @@ def latlong_to_cube(radiance: NDArray[np.float32], resolution: int, rotate_degre
 
 
 @lru_cache(maxsize=4)
-def _strip_meridians(resolution: int) -> NDArray[np.float64]:
+def _strip_meridians(resolution: int, width: int) -> tuple[NDArray[np.float64], ...]:
     """Longitudes of the corners of all texels of the pole faces, which include the borders of the side faces' texels,
-    and evenly spaced ones."""
+    and evenly spaced ones where the `width` columns of the map are wider."""
     half = np.arange(-resolution, resolution + 1, 2)
     i, j = np.meshgrid(half, half, indexing="ij")
     keep = (i != 0) | (j != 0)
@@ -91,8 +91,9 @@ def _strip_meridians(resolution: int) -> NDArray[np.float64]:
     once = g <= 2  # every direction's nearest corner: odd ones have g = 1, even ones 2
     corners = np.arctan2(i[once].astype(np.float64), j[once].astype(np.float64))
     steps = STRIPS * resolution
-    even = -math.pi + (2.0 * math.pi / steps) * np.arange(steps)
-    return np.concatenate([corners, even])
+    if width >= steps:
+        return (corners,)
+    return corners, -math.pi + (2.0 * math.pi / steps) * np.arange(steps)
 
 
 @lru_cache(maxsize=1)
@@ -116,32 +117,42 @@ def _walk(radiance, column_of, borders, row_edges, row_half_angles, table, resol
     edges = np.empty(6 * resolution + 8)
     half_angles = np.empty(6 * resolution + 8)
     texels = np.empty(6 * resolution + 8, np.int64)
-    total = np.empty((3, 3))
-    rows = (0, len(row_edges) - 1)
+    light = np.empty((len(row_edges) - 1, 3))
+    rows = (0, len(light))
+    held = -1
     for strip in range(len(column_of)):
         low, high = borders[strip], borders[strip + 1]
         if high - low < 1e-14:
             continue
+        if column_of[strip] != held:
+            held = column_of[strip]
+            take_column(radiance, held, rows, light)
         middle = 0.5 * (low + high)
         count = _meridian(math.sin(middle), math.cos(middle), resolution, table, edges, half_angles, texels)
         merge_strip(
-            radiance, column_of[strip], rows, row_edges, row_half_angles, edges, half_angles, texels, count,
-            middle, high - low, total, out,
+            light, rows, row_edges, row_half_angles, edges, half_angles, texels, count, middle, high - low, out
         )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
+def take_column(radiance, column, rows, light):  # type: ignore[no-untyped-def]
+    """Pixels of a column of a map (H, W, 3), from rows[0] to rows[1] counted from the south pole, to light (H, 3)."""
+    for row in range(rows[0], rows[1]):
+        for c in range(3):
+            light[row, c] = radiance[len(light) - 1 - row, column, c]
+
+
+@njit(cache=True, nogil=True)
 def merge_strip(  # type: ignore[no-untyped-def]
-    radiance, column, rows, row_edges, row_half_angles, edges, half_angles, places, count, middle, width, total, out
+    light, rows, row_edges, row_half_angles, edges, half_angles, places, count, middle, width, out
 ):
     """Adds the light of a column's pixels, in a strip of `width` radians about the longitude `middle`, to the places
     that the meridian meets.
 
-    Rows are counted from the south pole; those from rows[0] to rows[1] take part. row_edges (H + 1,): s = sin(latitude)
-    of their borders; edges: the same of the `count` places; half_angles: antiderivatives of cos(latitude) over s there.
-    out (P, 3, 4): per place and colour the flux and the moment. total: room, (3, 3).
+    light (H, 3) float64: of `take_column`, the pixels from rows[0] to rows[1] take part. row_edges (H + 1,):
+    s = sin(latitude) of the rows' borders; edges: the same of the `count` places; half_angles: antiderivatives of
+    cos(latitude) over s there. out (P, 3, 4): per place and colour the flux and the moment.
     """
-    height = len(row_edges) - 1
     # integral of (sin, cos) of the longitude over the strip
     wx = 2.0 * math.sin(middle) * math.sin(0.5 * width)
     wz = 2.0 * math.cos(middle) * math.sin(0.5 * width)
@@ -149,34 +160,37 @@ def merge_strip(  # type: ignore[no-untyped-def]
     s, below = row_edges[row], row_half_angles[row]
     while k + 1 < count and edges[k + 1] <= s:
         k += 1
-    total[:] = 0.0  # of a place, per colour: over s, over s times cos(latitude), over s^2 / 2
     while row < rows[1] and k < count:
-        next_row, next_k = row, k
-        if row_edges[row + 1] <= edges[k + 1]:
-            top, above = row_edges[row + 1], row_half_angles[row + 1]
-            next_row += 1
-            if top == edges[k + 1]:
-                next_k += 1
-        else:
-            top, above = edges[k + 1], half_angles[k + 1]
-            next_k += 1
-        if top > s:
-            area, across, level = top - s, above - below, 0.5 * (top * top - s * s)
-            for c in range(3):
-                value = np.float64(radiance[height - 1 - row, column, c])
-                total[c, 0] += value * area
-                total[c, 1] += value * across
-                total[c, 2] += value * level
-            s, below = top, above
-        if next_k != k or next_row == rows[1]:
-            to = out[places[k]]
-            for c in range(3):
-                to[c, 0] += width * total[c, 0]
-                to[c, 1] += wx * total[c, 1]
-                to[c, 2] += width * total[c, 2]
-                to[c, 3] += wz * total[c, 1]
-            total[:] = 0.0
-        row, k = next_row, next_k
+        end = edges[k + 1]
+        # of a place, per colour: light over s, over s times cos(latitude), over s^2 / 2
+        r0 = r1 = r2 = g0 = g1 = g2 = b0 = b1 = b2 = 0.0
+        while True:
+            whole = row_edges[row + 1] <= end
+            top = row_edges[row + 1] if whole else end
+            above = row_half_angles[row + 1] if whole else half_angles[k + 1]
+            if top > s:
+                area, across, level = top - s, above - below, 0.5 * (top * top - s * s)
+                red, green, blue = light[row, 0], light[row, 1], light[row, 2]
+                r0, r1, r2 = r0 + red * area, r1 + red * across, r2 + red * level
+                g0, g1, g2 = g0 + green * area, g1 + green * across, g2 + green * level
+                b0, b1, b2 = b0 + blue * area, b1 + blue * across, b2 + blue * level
+                s, below = top, above
+            if not whole:
+                break
+            row += 1
+            if row == rows[1]:
+                break
+        to = out[places[k]]
+        to[0, 0], to[0, 1], to[0, 2], to[0, 3] = (
+            to[0, 0] + width * r0, to[0, 1] + wx * r1, to[0, 2] + width * r2, to[0, 3] + wz * r1
+        )  # fmt: skip
+        to[1, 0], to[1, 1], to[1, 2], to[1, 3] = (
+            to[1, 0] + width * g0, to[1, 1] + wx * g1, to[1, 2] + width * g2, to[1, 3] + wz * g1
+        )  # fmt: skip
+        to[2, 0], to[2, 1], to[2, 2], to[2, 3] = (
+            to[2, 0] + width * b0, to[2, 1] + wx * b1, to[2, 2] + width * b2, to[2, 3] + wz * b1
+        )  # fmt: skip
+        k += 1
 
 
 @njit(cache=True, nogil=True)

@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from relightcli.core.lights.environment import half_angle, half_angles_table, merge_strip
+from relightcli.core.lights.environment import half_angle, half_angles_table, merge_strip, take_column
 from relightcli.core.lights.quadtree import Tree, leaf_of_texel
 
 WIDEST = math.radians(0.36)  # of a strip
@@ -104,15 +104,19 @@ def _strips(width: int, turn: float, tree: Tree) -> tuple[NDArray[np.int64], NDA
 def _walk(radiance, strips, columns, borders, south, tree, row_edges, row_half_angles, table, out):  # type: ignore[no-untyped-def]
     room = 6 * tree.resolution + 8
     edges, half_angles, leaves = np.empty(room), np.empty(room), np.empty(room, np.int64)
-    total = np.empty((3, 3))
+    light = np.empty((len(row_edges) - 1, 3))
+    held = -1
     for strip in strips:
         low, high = borders[strip], borders[strip + 1]
         middle = 0.5 * (low + high)
+        column = columns[strip]
+        rows = (south[column, 0], south[column, 1])
+        if column != held:
+            held = column
+            take_column(radiance, column, rows, light)
         count = _meridian(tree, math.sin(middle), math.cos(middle), table, edges, half_angles, leaves)
-        rows = (south[columns[strip], 0], south[columns[strip], 1])
         merge_strip(
-            radiance, columns[strip], rows, row_edges, row_half_angles, edges, half_angles, leaves, count,
-            middle, high - low, total, out,
+            light, rows, row_edges, row_half_angles, edges, half_angles, leaves, count, middle, high - low, out
         )  # fmt: skip
 
 
