@@ -21,7 +21,7 @@ import relight_formats as formats
 from relightcli.core.brdf.models import SPECULAR as SPECULAR_COLUMN
 from relightcli.core.brdf.separable import POLAR
 from relightcli.core.lights.environment import SkyCube, latlong_to_cube, splat
-from relightcli.core.shade.gather import in_parts
+from relightcli.core.shade.gather import in_parts, side_by_side
 from relightcli.core.shade.irradiance import irradiance, moment_prefix
 from relightcli.core.shade.low_order import response, shade_low_order
 from relightcli.core.transport.channels import SHINY, coefficients, plan_channels
@@ -33,6 +33,8 @@ from relightcli.stages.lighting import LightingStore, Radiance, _Coats
 from relightcli.stages.transfer_setup import CELLS, COARSE, LAMP_COLUMNS, cell_radiance, fit_receivers
 
 Factors = NDArray[np.float32]
+
+ROWS = 128  # receivers of a matrix product: it stays in a core's memory, and on one thread
 
 
 class AssetStore(LightingStore):
@@ -71,16 +73,36 @@ class AssetStore(LightingStore):
         if bounces > self.bounces:
             raise InputError(f"--bounces {bounces}: the asset has {self.bounces}; use the transfer store it came from")
         coats = self._coats_of(materials)
-        if basis is None:
-            if coats.shiny.any() and view is None:
-                raise InputError("a material with a specular lobe looks different from everywhere: name a --camera")
-            sky, spread = self._sky_of(environment, rotate)
-            parts = [self._direct_tensors(sky, spread, environment, rotate, coats, view, active)]
-        else:
+        if basis is None and coats.shiny.any() and view is None:
+            raise InputError("a material with a specular lobe looks different from everywhere: name a --camera")
+        if basis is not None:
             parts = super().exit_radiance(environment, rotate, materials, view, active, basis, 0)
-            sky, spread = self._sky_of(environment, rotate)
-        if bounces == 0:
+        if basis is not None and bounces == 0:
             return parts
+        sky, spread = self._sky_of(environment, rotate)
+
+        def direct() -> list[Radiance]:
+            if basis is not None:
+                return parts
+            return [self._direct_tensors(sky, spread, environment, rotate, coats, view, active)]
+
+        if bounces == 0:
+            return direct()
+        first, rest = side_by_side(
+            direct, lambda: self._tensor_bounces(sky, spread, coats, view, active, bounces), self.threads
+        )
+        return first + rest
+
+    def _tensor_bounces(
+        self,
+        sky: SkyCube,
+        spread: SkyCube,
+        coats: _Coats,
+        view: NDArray[np.float32] | None,
+        active: NDArray[np.bool_] | None,
+        bounces: int,
+    ) -> list[Radiance]:
+        """Exit radiance after each of the interreflections."""
         if self._tensors is None:
             self._tensors = _Tensors(self)
         tensors = self._tensors
@@ -88,9 +110,10 @@ class AssetStore(LightingStore):
         tensors.set_materials(coefficients(self.channels, coats.table, self.functions))
         shines = bool(coats.shiny.any()) and view is not None
         specular = self._specular(coats, view, active) if shines else [None] * len(tensors.even)
-        for k, (even, lobes) in enumerate(zip(tensors.even[:bounces], specular[:bounces], strict=True)):
-            parts.append(Radiance(self._diffuse_of(k + 1, even, coats), lobes))
-        return parts
+        return [
+            Radiance(self._diffuse_of(k + 1, even, coats), lobes)
+            for k, (even, lobes) in enumerate(zip(tensors.even[:bounces], specular[:bounces], strict=True))
+        ]
 
     def _coats_of(self, materials: dict[str, Material]) -> _Coats:
         for material, model in zip(materials.values(), self.made_for, strict=True):
@@ -194,17 +217,18 @@ class _Tensors:
         receiver: NDArray[np.int32] = read("cluster/receiver")
         start: NDArray[np.int64] = read("cluster/start")
         self.receiver = receiver
-        self.cluster = np.repeat(np.arange(len(start) - 1), np.diff(start)).astype(np.int32)
-        place = np.arange(len(receiver)) - start[self.cluster]
+        self.start = start
+        cluster = np.repeat(np.arange(len(start) - 1), np.diff(start)).astype(np.int32)
+        place = np.arange(len(receiver)) - start[cluster]
         self.basis: NDArray[np.float32] = read("one_bounce/basis")
         self.q = len(asset.channels.material)
-        self.rows = [_factors(asset.store, "one_bounce/receiver_factor")[self.cluster, place]]
+        self.rows = [_factors(asset.store, "one_bounce/receiver_factor")[cluster, place]]
         self.light_factor = _factors(asset.store, "one_bounce/light_factor")
         core = _factors(asset.store, "one_bounce/core")
         self.core = core.reshape(*core.shape[:2], -1)
         self.second: Factors | None = None
         if asset.bounces > 1:
-            self.rows.append(_factors(asset.store, "two_bounce/receiver_factor")[self.cluster, place])
+            self.rows.append(_factors(asset.store, "two_bounce/receiver_factor")[cluster, place])
             core = _factors(asset.store, "two_bounce/core")
             lights = asset.store.layouts["two_bounce/keep"].shape[0] + asset.lamps
             parts = core.reshape(*core.shape[:2], -1, lights, self.q)  # light last, for a plain product with it
@@ -285,11 +309,11 @@ class _Tensors:
 
         def part(a: int, b: int) -> None:
             _spread(
-                a, b, rows, self.cluster, flat, self.even_weights, self.receiver, even,
-                self.lobe_row, self.rotations, local,
+                a, b, rows, self.start, flat, self.even_weights, self.receiver, even, self.lobe_row,
+                self.rotations, local,
             )  # fmt: skip
 
-        in_parts(part, len(rows), self.asset.threads)
+        in_parts(part, c, self.asset.threads)
         self.even.append(even)
         if s == 1:
             self.uniform = local[:, :, 0]
@@ -320,49 +344,44 @@ def _factors(store: formats.Store, name: str) -> Factors:
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
-def _spread(first, last, rows, cluster, flat, even_weights, receiver, even, lobe_row, rotations, local):  # type: ignore[no-untyped-def]
+def _spread(first, last, rows, start, flat, even_weights, receiver, even, lobe_row, rotations, local):  # type: ignore[no-untyped-def]
+    """From the vectors of clusters first to last to their receivers: even, and in the receivers' frames."""
     size = flat.shape[2]
     count = size // 3
-    world = np.empty(size, np.float32)
+    room = np.empty((ROWS, size), np.float32)
     zero = np.float32(0.0)
-    for i in range(first, last):
-        world[:] = zero
-        vectors = flat[cluster[i]]
-        for v in range(0, rows.shape[1] - 3, 4):  # four at a time: fewer passes over the sums
-            w0, w1, w2, w3 = rows[i, v], rows[i, v + 1], rows[i, v + 2], rows[i, v + 3]
-            f0, f1, f2, f3 = vectors[v], vectors[v + 1], vectors[v + 2], vectors[v + 3]
-            for k in range(size):
-                world[k] += (w0 * f0[k] + w1 * f1[k]) + (w2 * f2[k] + w3 * f3[k])
-        for v in range(rows.shape[1] // 4 * 4, rows.shape[1]):
-            w0, f0 = rows[i, v], vectors[v]
-            for k in range(size):
-                world[k] += w0 * f0[k]
-        row = lobe_row[i]
-        for colour in range(3):
-            light = world[colour * count : (colour + 1) * count]
-            total = light[0]  # of a uniform value: the mean itself
-            if count > 1:
-                total = zero
-                for k in range(count):
-                    total += even_weights[i, k] * light[k]
-            even[receiver[i], colour] = max(total, zero)
-            if row >= 0:
-                target = local[row, colour]
-                if count == 1:
-                    target[0] = max(total, zero)
-                    continue
-                if count == 16:  # four bands, their loops unrolled
-                    _turn(rotations[row], 0, light, 0, target, 1)
-                    _turn(rotations[row], 1, light, 1, target, 3)
-                    _turn(rotations[row], 10, light, 4, target, 5)
-                    _turn(rotations[row], 35, light, 9, target, 7)
-                    continue
-                at = low = band = 0
-                while low < count:
-                    n = 2 * band + 1  # harmonics of the band
-                    _turn(rotations[row], at, light, low, target, n)
-                    at += n * n
-                    low, band = low + n, band + 1
+    for own in range(first, last):
+        for low in range(start[own], start[own + 1], ROWS):
+            high = min(low + ROWS, start[own + 1])
+            np.dot(rows[low:high], flat[own], room[: high - low])
+            for i in range(low, high):
+                world = room[i - low]
+                row = lobe_row[i]
+                for colour in range(3):
+                    light = world[colour * count : (colour + 1) * count]
+                    total = light[0]  # of a uniform value: the mean itself
+                    if count > 1:
+                        total = zero
+                        for k in range(count):
+                            total += even_weights[i, k] * light[k]
+                    even[receiver[i], colour] = max(total, zero)
+                    if row >= 0:
+                        target = local[row, colour]
+                        if count == 1:
+                            target[0] = max(total, zero)
+                            continue
+                        if count == 16:  # four bands, their loops unrolled
+                            _turn(rotations[row], 0, light, 0, target, 1)
+                            _turn(rotations[row], 1, light, 1, target, 3)
+                            _turn(rotations[row], 10, light, 4, target, 5)
+                            _turn(rotations[row], 35, light, 9, target, 7)
+                            continue
+                        at = low = band = 0
+                        while low < count:
+                            n = 2 * band + 1  # harmonics of the band
+                            _turn(rotations[row], at, light, low, target, n)
+                            at += n * n
+                            low, band = low + n, band + 1
 
 
 @njit(cache=True, nogil=True, inline="always", fastmath={"reassoc", "contract", "nsz"})

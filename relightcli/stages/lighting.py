@@ -303,14 +303,16 @@ class LightingStore:
     def _coats(self, materials: list[Material]) -> _Coats:
         material = self.geometry.material[self.object]
         through = np.array([m.transmittance if m.model == "translucent" else BLACK for m in materials], np.float32)
-        through = through[material]
+        albedo = np.array([m.diffuse for m in materials], np.float32)
+        shiny = np.array([m.model in SHINY and m.specular != BLACK for m in materials], bool)
+        passes = bool(through[material].any()) if through.any() else False
         return _Coats(
             material,
             pack_materials(materials),
-            np.array([m.diffuse for m in materials], np.float32)[material],
-            through,
-            self.partner() if through.any() else None,
-            np.array([m.model in SHINY and m.specular != BLACK for m in materials], bool)[material],
+            np.take(albedo, material, axis=0),
+            np.take(through, material, axis=0) if passes else np.zeros((len(material), 3), np.float32),
+            self.partner() if passes else None,
+            np.take(shiny, material),
         )
 
     def _direct(

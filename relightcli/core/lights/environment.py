@@ -93,7 +93,7 @@ def _strip_meridians(resolution: int, width: int) -> tuple[NDArray[np.float64], 
     steps = STRIPS * resolution
     if width >= steps:
         return (corners,)
-    return corners, -math.pi + (2.0 * math.pi / steps) * np.arange(steps)
+    return corners, -math.pi + (2.0 * math.pi / steps) * np.arange(steps, dtype=np.float64)
 
 
 @lru_cache(maxsize=1)

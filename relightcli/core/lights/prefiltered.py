@@ -128,16 +128,16 @@ def _plan(resolution: int, degrees: float, threads: int) -> _Plan:
     node = _nodes(n).reshape(-1, 3).astype(np.float32)
     side = source // min(_TILE, source)
     tiles = cube.texel_directions(side).reshape(-1, 3).astype(np.float32)
-    near = np.float32(math.cos(min(math.pi, end + 1.5 / side)))
-    count = np.zeros(len(node), np.int64)
-    in_parts(lambda a, b: _count(node[a:b], tiles, near, count[a:b]), len(node), threads)
-    start = np.concatenate([[0], np.cumsum(count)])
+    reach = (np.float32(math.cos(min(math.pi, end + 1.5 / side))), 2.0 - 2.0 * math.cos(end))
     center = _by_tile(cube.texel_directions(source).reshape(-1, 3), source)
+    count = np.zeros(len(node), np.int64)
+    in_parts(lambda a, b: _count(node[a:b], tiles, center, *reach, count[a:b]), len(node), threads)
+    start = np.concatenate([[0], np.cumsum(count)])
     tile = np.empty(start[-1], np.int32)
     weight = np.empty((start[-1], center.shape[2]), np.float32)
-    kernel = (near, 2.0 - 2.0 * math.cos(end), -0.5 / narrow**2, 1.0 / integral)
+    kernel = (-0.5 / narrow**2, 1.0 / integral)
     in_parts(
-        lambda a, b: _weigh(node[a:b], start[a:b], tiles, center, *kernel, tile, weight),
+        lambda a, b: _weigh(node[a:b], start[a:b], tiles, center, *reach, *kernel, tile, weight),
         len(node),
         threads,
     )
@@ -189,11 +189,23 @@ def _meet(around, share, radiance, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _count(node, tiles, near, count):  # type: ignore[no-untyped-def]
+def _reached(x, y, z, tiles, center, near, end, c):  # type: ignore[no-untyped-def]
+    """Whether any texel of tile c has a centre whose chord's square from the node is below `end`."""
+    if x * tiles[c, 0] + y * tiles[c, 1] + z * tiles[c, 2] < near:  # none by far
+        return False
+    for t in range(center.shape[2]):
+        dx, dy, dz = x - center[c, 0, t], y - center[c, 1, t], z - center[c, 2, t]
+        if dx * dx + dy * dy + dz * dz < end:
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _count(node, tiles, center, near, end, count):  # type: ignore[no-untyped-def]
     for m in range(len(node)):
+        x, y, z = node[m, 0], node[m, 1], node[m, 2]
         for c in range(len(tiles)):
-            if node[m, 0] * tiles[c, 0] + node[m, 1] * tiles[c, 1] + node[m, 2] * tiles[c, 2] >= near:
-                count[m] += 1
+            count[m] += _reached(x, y, z, tiles, center, near, end, c)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -202,7 +214,7 @@ def _weigh(node, start, tiles, center, near, end, exponent, scale, tile, weight)
         x, y, z = node[m, 0], node[m, 1], node[m, 2]
         p = start[m]
         for c in range(len(tiles)):
-            if x * tiles[c, 0] + y * tiles[c, 1] + z * tiles[c, 2] < near:
+            if not _reached(x, y, z, tiles, center, near, end, c):
                 continue
             tile[p] = c
             for t in range(center.shape[2]):

@@ -6,13 +6,16 @@ import itertools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.sphere import cube
+
+A = TypeVar("A")
+B = TypeVar("B")
 
 
 class Gather(NamedTuple):
@@ -138,6 +141,15 @@ def in_parts(work: Callable[[int, int], None], count: int, threads: int) -> None
     pool = _pool(threads)
     for job in [pool.submit(work, a, b) for a, b in itertools.pairwise(cuts.tolist()) if b > a]:
         job.result()
+
+
+def side_by_side(first: Callable[[], A], second: Callable[[], B], threads: int) -> tuple[A, B]:
+    """Both results; with several threads what runs on one in either overlaps with the other."""
+    if threads <= 1:
+        return first(), second()
+    with ThreadPoolExecutor(1) as beside:
+        later = beside.submit(second)
+        return first(), later.result()
 
 
 @lru_cache(maxsize=4)
