@@ -21,7 +21,7 @@ import relight_formats as formats
 from relightcli.core.brdf.models import SPECULAR as SPECULAR_COLUMN
 from relightcli.core.brdf.separable import POLAR
 from relightcli.core.lights.environment import SkyCube, latlong_to_cube, splat
-from relightcli.core.shade.gather import in_parts, side_by_side
+from relightcli.core.parts import in_parts, side_by_side
 from relightcli.core.shade.irradiance import irradiance, moment_prefix
 from relightcli.core.shade.low_order import response, shade_low_order
 from relightcli.core.transport.channels import SHINY, coefficients, plan_channels

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from relightcli.core.fields.entities import Entity, Lookup, look_up
 from relightcli.core.fields.standing import Between
-from relightcli.core.shade.gather import in_parts
+from relightcli.core.parts import in_parts
 from relightcli.core.sphere.triple_product import coefficients
 from relightcli.core.sphere.window import window
 

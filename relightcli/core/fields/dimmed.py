@@ -17,7 +17,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.lights.environment import SkyCube
-from relightcli.core.shade.gather import Gather, in_parts
+from relightcli.core.parts import in_parts
+from relightcli.core.shade.gather import Gather
 from relightcli.core.sphere import cube, sh
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from relightcli.core.fields.field import Field, SourceField
 from relightcli.core.fields.interpolate import CORNERS, Grid, locate_one, make_grid, shell_steps
-from relightcli.core.shade.gather import in_parts
+from relightcli.core.parts import in_parts
 from relightcli.core.sphere.rotation import rotation_matrices
 
 

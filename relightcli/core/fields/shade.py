@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.fields.body import axes, clamped_cosine
-from relightcli.core.shade.gather import in_parts
+from relightcli.core.parts import in_parts
 from relightcli.core.shade.low_order import shade_low_order
 from relightcli.core.sphere import sh
 from relightcli.core.sphere.rotation import rotation_matrices

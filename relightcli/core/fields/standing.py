@@ -22,8 +22,8 @@ from scipy.spatial import cKDTree
 
 from relightcli.core.brdf.separable import TERMS
 from relightcli.core.lights.environment import SkyCube
+from relightcli.core.parts import in_parts
 from relightcli.core.shade.bounces import Exit
-from relightcli.core.shade.gather import in_parts
 from relightcli.core.shade.lobe_factors import LobeFactors, axes_of, send_lobe, waves
 from relightcli.core.sphere import cube, sh
 from relightcli.core.transport.tracer import Tracer

@@ -11,7 +11,6 @@ the poles, and six to eight times better in the mean square.
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -19,6 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from relightcli.core.parts import in_parts
 from relightcli.core.sphere import cube
 
 TABLE = 1 << 13
@@ -63,18 +63,16 @@ def latlong_to_cube(radiance: NDArray[np.float32], resolution: int, rotate_degre
     source = np.ascontiguousarray(radiance, np.float32)
     table = half_angles_table()
     parts = [np.zeros((6 * resolution * resolution, 3, 4)) for _ in range(2)]
-    cut = len(column_of) // 2
-    with ThreadPoolExecutor(2) as pool:
-        list(
-            pool.map(
-                lambda a, b, out: _walk(
-                    source, column_of[a:b], borders[a : b + 1], row_edges, row_half_angles, table, resolution, out
-                ),
-                (0, cut),
-                (cut, len(column_of)),
-                parts,
-            )
-        )
+    cuts = (0, len(column_of) // 2, len(column_of))
+
+    def walk(first: int, last: int) -> None:
+        for k in range(first, last):
+            a, b = cuts[k], cuts[k + 1]
+            _walk(
+                source, column_of[a:b], borders[a : b + 1], row_edges, row_half_angles, table, resolution, parts[k]
+            )  # fmt: skip
+
+    in_parts(walk, 2, 2)
     out = parts[0] + parts[1]
     return SkyCube(resolution, out[:, :, 0].copy(), out[:, :, 1:].copy())
 

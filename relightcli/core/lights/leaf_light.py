@@ -10,7 +10,6 @@ touches, to the bit no others.
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 
 from relightcli.core.lights.environment import half_angle, half_angles_table, merge_strip, take_column
 from relightcli.core.lights.quadtree import Tree, leaf_of_texel
+from relightcli.core.parts import in_parts
 
 WIDEST = math.radians(0.36)  # of a strip
 BANDS = 8  # of strips, summed apart
@@ -59,17 +59,14 @@ class Splitter:
         bands = np.array_split(strips, BANDS if len(strips) > FEW else 1)
         parts = [np.zeros((len(self.tree.cell), 3, 4)) for _ in bands]
 
-        def walk(band: NDArray[np.int64], out: NDArray[np.float64]) -> None:
-            _walk(
-                source, band, self._column, self._borders, south, self.tree,
-                self._row_edges, self._row_half_angles, half_angles_table(), out,
-            )  # fmt: skip
+        def walk(first: int, last: int) -> None:
+            for band, out in zip(bands[first:last], parts[first:last], strict=True):
+                _walk(
+                    source, band, self._column, self._borders, south, self.tree,
+                    self._row_edges, self._row_half_angles, half_angles_table(), out,
+                )  # fmt: skip
 
-        if len(bands) == 1:
-            walk(strips, parts[0])
-        else:
-            with ThreadPoolExecutor(max(1, threads)) as pool:
-                list(pool.map(walk, bands, parts))
+        in_parts(walk, len(bands), threads)
         total = parts[0]
         for part in parts[1:]:
             total += part

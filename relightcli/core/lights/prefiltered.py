@@ -22,7 +22,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.lights.environment import SkyCube
-from relightcli.core.shade.gather import in_parts
+from relightcli.core.parts import in_parts
 from relightcli.core.sphere import cube
 
 # A lobe is summed over this many standard deviations.

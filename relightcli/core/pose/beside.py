@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.lights.environment import SkyCube, splat
-from relightcli.core.shade.gather import in_parts
+from relightcli.core.parts import in_parts
 from relightcli.core.sphere import cube, sh
 
 F32 = NDArray[np.float32]

@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from relightcli.core.shade.gather import in_parts
+from relightcli.core.parts import in_parts
 
 CUT = 1e-8  # of the largest singular value
 COMPONENTS = 20  # at most, unless asked for more: ten thousand vertices take 5 MB

@@ -19,10 +19,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from relightcli.core.parts import in_parts
 from relightcli.core.pose.lobe_parameters import ANGLES, LOG, tangents_of
 from relightcli.core.pose.phong_operator import lighting_matrix
 from relightcli.core.pose.zh_lobes import unit_harmonics, unit_norms
-from relightcli.core.shade.gather import in_parts
 from relightcli.core.sphere import sh
 
 F32 = NDArray[np.float32]

@@ -26,7 +26,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from relightcli.core.shade.gather import in_parts
+from relightcli.core.parts import in_parts
 
 RIDGE = 1e-2
 STEPS = 12  # of Gauss-Newton and their damped trials, per frame

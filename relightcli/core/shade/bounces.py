@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from relightcli.core.brdf.models import MaterialTable, dot, lobes_and_density
 from relightcli.core.brdf.separable import TERMS
-from relightcli.core.shade.gather import Gather, in_parts
+from relightcli.core.parts import in_parts
+from relightcli.core.shade.gather import Gather
 from relightcli.core.shade.lobe_factors import LobeFactors, axes_of, gather_lobe, send_lobe, waves
 from relightcli.core.sphere import cube
 

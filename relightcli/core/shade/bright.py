@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from relightcli.core.brdf.models import dot, lobes_and_density
 from relightcli.core.lights.environment import SkyCube
 from relightcli.core.lights.latlong import LUMINANCE
-from relightcli.core.shade.gather import in_parts
+from relightcli.core.parts import in_parts
 from relightcli.core.sphere import cube
 
 COUNT = 24

@@ -18,7 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.lights.leaf_light import LeafLight
-from relightcli.core.shade.gather import in_parts
+from relightcli.core.parts import in_parts
 
 GROUP = 64
 FEW = 16  # clusters that one thread changes sooner than several start

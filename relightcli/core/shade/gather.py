@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from relightcli.core.parts import in_parts
 from relightcli.core.sphere import cube
-
-A = TypeVar("A")
-B = TypeVar("B")
 
 
 class Gather(NamedTuple):
@@ -129,32 +124,6 @@ def replace_rows(gather: Gather, rows: NDArray[np.int64], part: Gather) -> Gathe
         put(gather.cosine, part.cosine),
         put(gather.solid_angle, part.solid_angle),
     )
-
-
-def in_parts(work: Callable[[int, int], None], count: int, threads: int) -> None:
-    """Calls work(start, stop) for parts of range(count), on `threads` threads that stay for the next call."""
-    if threads <= 1:
-        if count:
-            work(0, count)
-        return
-    cuts = np.linspace(0, count, 6 * threads + 1).astype(int)
-    pool = _pool(threads)
-    for job in [pool.submit(work, a, b) for a, b in itertools.pairwise(cuts.tolist()) if b > a]:
-        job.result()
-
-
-def side_by_side(first: Callable[[], A], second: Callable[[], B], threads: int) -> tuple[A, B]:
-    """Both results; with several threads what runs on one in either overlaps with the other."""
-    if threads <= 1:
-        return first(), second()
-    with ThreadPoolExecutor(1) as beside:
-        later = beside.submit(second)
-        return first(), later.result()
-
-
-@lru_cache(maxsize=4)
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads)
 
 
 @njit(cache=True, nogil=True)

@@ -8,9 +8,7 @@ is opened, down to single texels. Lobes narrower than a texel are left to `narro
 
 from __future__ import annotations
 
-import itertools
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +28,7 @@ from relightcli.core.brdf.models import (
     tan2_between,
 )
 from relightcli.core.lights.environment import SkyCube
+from relightcli.core.parts import in_parts
 from relightcli.core.shade.narrow import add_suns, sample_lobe, suns
 from relightcli.core.sphere import cube
 
@@ -110,35 +109,30 @@ def specular_radiance(
     bits (N, 6, R, R/8); normals (M, 3), views (M, 3) unit directions to the viewer; material (M,) rows of `table`.
     """
     out = np.zeros((len(rows), 3), np.float32)
-    cuts = np.linspace(0, len(rows), 8 * max(1, threads) + 1).astype(int)
-    with ThreadPoolExecutor(max(1, threads)) as pool:
-        jobs = [
-            pool.submit(
-                _integrate,
-                bits,
-                rows[a:b],
-                normals[a:b],
-                views[a:b],
-                material[a:b],
-                table.model,
-                table.parameters,
-                tree.resolution,
-                tree.first,
-                tree.flux,
-                tree.direction,
-                tree.reach,
-                tree.map,
-                tree.rotation,
-                tree.clamped,
-                tree.sun_direction,
-                tree.sun_flux,
-                out[a:b],
-            )
-            for a, b in itertools.pairwise(cuts)
-            if b > a
-        ]
-        for job in jobs:
-            job.result()
+
+    def part(a: int, b: int) -> None:
+        _integrate(
+            bits,
+            rows[a:b],
+            normals[a:b],
+            views[a:b],
+            material[a:b],
+            table.model,
+            table.parameters,
+            tree.resolution,
+            tree.first,
+            tree.flux,
+            tree.direction,
+            tree.reach,
+            tree.map,
+            tree.rotation,
+            tree.clamped,
+            tree.sun_direction,
+            tree.sun_flux,
+            out[a:b],
+        )
+
+    in_parts(part, len(rows), threads)
     colour = table.parameters[material][:, SPECULAR : SPECULAR + 3]
     return (out * colour).astype(np.float32)
 

@@ -7,9 +7,7 @@ each run costs two look-ups, whatever its length. No basis is involved: what is 
 
 from __future__ import annotations
 
-import itertools
 import math
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numba import njit
@@ -17,6 +15,7 @@ from numpy.typing import NDArray
 
 from relightcli.core.bits import trailing_zeros
 from relightcli.core.lights.environment import SkyCube
+from relightcli.core.parts import in_parts
 
 
 def moment_prefix(sky: SkyCube) -> NDArray[np.float64]:
@@ -45,15 +44,11 @@ def irradiance(
     normals = np.ascontiguousarray(normals, np.float32)
     if active is None:
         active = np.ones(len(bits), bool)
-    cuts = np.linspace(0, len(bits), 4 * max(1, threads) + 1).astype(int)
-    with ThreadPoolExecutor(max(1, threads)) as pool:
-        jobs = [
-            pool.submit(_sum_runs, words[a:b], normals[a:b], active[a:b], prefix, out[a:b])
-            for a, b in itertools.pairwise(cuts)
-            if b > a
-        ]
-        for job in jobs:
-            job.result()
+    in_parts(
+        lambda a, b: _sum_runs(words[a:b], normals[a:b], active[a:b], prefix, out[a:b]),
+        len(bits),
+        threads,
+    )
     return out
 
 

@@ -25,7 +25,7 @@ from relightcli.core.brdf.models import (
 from relightcli.core.brdf.sampling import orthonormal_frame
 from relightcli.core.brdf.separable import LEAST_WIDTH, POLAR, ROWS, TERMS, separate
 from relightcli.core.lights.environment import SkyCube
-from relightcli.core.shade.gather import in_parts
+from relightcli.core.parts import in_parts
 from relightcli.core.sphere import cube
 from relightcli.core.sphere.lattice import r2_point
 from relightcli.core.transport.light_visibility import point_count

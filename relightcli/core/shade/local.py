@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.brdf.models import MaterialTable, dot, lobes_and_density
+from relightcli.core.parts import in_parts
 from relightcli.core.sphere.lattice import r2_point
 from relightcli.core.transport.light_visibility import point_count
 from relightcli.core.transport.local_lights import LocalLights, sample_light
@@ -34,7 +33,6 @@ def local_radiance(
     irradiance = np.zeros((len(bits), 3), np.float32)
     specular = np.zeros((len(bits), 3), np.float32)
     towards = np.zeros((len(bits), 3), np.float32) if views is None else views
-    cuts = np.linspace(0, len(bits), 4 * max(1, threads) + 1).astype(int)
 
     def part(a: int, b: int) -> None:
         _sum_points(
@@ -52,8 +50,7 @@ def local_radiance(
             specular[a:b],
         )
 
-    with ThreadPoolExecutor(max(1, threads)) as pool:
-        list(pool.map(part, cuts[:-1], cuts[1:]))
+    in_parts(part, len(bits), threads)
     return irradiance, specular
 
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from relightcli.core.brdf.models import COOK_TORRANCE, F0, ROUGHNESS, SHININESS, pack_materials
 from relightcli.core.brdf.separable import POLAR, harmonics
 from relightcli.core.brdf.transport_basis import white, widths
-from relightcli.core.shade.gather import in_parts
+from relightcli.core.parts import in_parts
 from relightcli.core.shade.lobe_factors import axes_of
 from relightcli.core.sphere import sh
 

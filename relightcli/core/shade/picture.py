@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from relightcli.core.parts import in_parts
 from relightcli.core.shade.primary import Samples
 from relightcli.core.transport.shading import Surface, surface_at, white_scene
 from relightcli.scene.model import Geometry
@@ -188,23 +188,11 @@ def assemble(
     out = np.zeros((pixels, 3), np.float32)
     if specular is None:
         specular = np.zeros((0, 3), np.float32)
-    cuts = np.linspace(0, pixels, max(1, threads) + 1).astype(int)
-    with ThreadPoolExecutor(max(1, threads)) as pool:
-        list(
-            pool.map(
-                lambda a, b: _multiply(
-                    matrix.start[a : b + 1],
-                    matrix.receiver,
-                    matrix.weight,
-                    matrix.texture,
-                    diffuse,
-                    specular,
-                    out[a:b],
-                ),
-                cuts[:-1],
-                cuts[1:],
-            )
-        )
+
+    def part(a: int, b: int) -> None:
+        _multiply(matrix.start[a : b + 1], matrix.receiver, matrix.weight, matrix.texture, diffuse, specular, out[a:b])
+
+    in_parts(part, pixels, threads)
     return out
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from relightcli.core.brdf.models import MaterialTable, lobes_and_density
 from relightcli.core.lights.points import Points
-from relightcli.core.shade.gather import in_parts
+from relightcli.core.parts import in_parts
 
 
 def point_irradiance(

@@ -25,7 +25,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.brdf.direct_model import LightFactors
-from relightcli.core.shade.gather import in_parts
+from relightcli.core.parts import in_parts
 from relightcli.core.shade.lobe_factors import axes_of
 from relightcli.core.sphere import cube, haar
 

@@ -20,7 +20,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.lights.prefiltered import place_on_cube
-from relightcli.core.shade.gather import in_parts
+from relightcli.core.parts import in_parts
 from relightcli.core.shade.lobe_factors import axes_of
 from relightcli.core.shade.narrow import cube_texel
 

@@ -20,7 +20,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.brdf.separable import POLAR, ROWS, TERMS
-from relightcli.core.shade.gather import Gather, in_parts
+from relightcli.core.parts import in_parts
+from relightcli.core.shade.gather import Gather
 from relightcli.core.shade.lobe_factors import FAST, axes_of, waves
 from relightcli.core.sphere import cube, sh
 

@@ -1,0 +1,51 @@
+"""Work on the threads of this process, for kernels that let go of Python's lock."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from typing import TypeVar
+
+import numpy as np
+
+A = TypeVar("A")
+B = TypeVar("B")
+
+
+def in_parts(work: Callable[[int, int], None], count: int, threads: int) -> None:
+    """Calls work(start, stop) for parts of range(count), here and on `threads` - 1 others that stay."""
+    if threads <= 1:
+        if count:
+            work(0, count)
+        return
+    cuts = np.linspace(0, count, 6 * threads + 1).astype(int).tolist()
+    parts = iter([(a, b) for a, b in itertools.pairwise(cuts) if b > a])  # a list's iterator is safe to share
+
+    def take() -> None:
+        for a, b in parts:
+            work(a, b)
+
+    pool = _pool(threads - 1)
+    others = [pool.submit(take) for _ in range(threads - 1)]
+    try:
+        take()
+    finally:
+        for other in others:
+            if not other.cancel():  # one that has not begun is not needed any more
+                other.result()
+
+
+def side_by_side(first: Callable[[], A], second: Callable[[], B], threads: int) -> tuple[A, B]:
+    """Both results; with several threads what runs on one in either overlaps with the other."""
+    if threads <= 1:
+        return first(), second()
+    with ThreadPoolExecutor(1) as beside:
+        later = beside.submit(second)
+        return first(), later.result()
+
+
+@lru_cache(maxsize=4)
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads)
