@@ -8,8 +8,8 @@ import pytest
 from relightcli.core.parts import in_parts, side_by_side
 
 
-@pytest.mark.parametrize("threads", (1, 2, 3))
-@pytest.mark.parametrize("count", (0, 1, 5, 1000))
+@pytest.mark.parametrize("threads", [1, 2, 3])
+@pytest.mark.parametrize("count", [0, 1, 5, 1000])
 def test_every_index_once(threads: int, count: int) -> None:
     done = np.zeros(count, int)
 
