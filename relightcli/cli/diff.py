@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 )
 @click.option("--heatmap", type=options.PATH, help="Write the first metric per pixel as a picture.")
 @click.option("--report", type=options.PATH, help="Write one self-contained HTML page.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout, and nothing else.")
+@options.report
 @click.pass_context
 def command(
     context: click.Context,
@@ -50,6 +50,8 @@ def command(
     heatmap: Path | None,
     report: Path | None,
     as_json: bool,
+    quiet: bool,
+    verbose: bool,
 ) -> None:
     """Measure A, the test, against B, the reference.
 
@@ -64,7 +66,8 @@ def command(
     metrics = tuple(dict.fromkeys(metrics)) or ("relrmse",)
     settings = DiffSettings(metrics, parse_thresholds(fail, metrics), fail_percent, heatmap, report)
     result = diff(a, b, settings)
-    click.echo(json.dumps(result.to_json()) if as_json else _text(result))
+    if as_json or not quiet:
+        click.echo(json.dumps(result.to_json()) if as_json else _text(result))
     context.exit(0 if result.passed else 1)
 
 

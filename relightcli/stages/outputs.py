@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from relightcli.adapters import images
 from relightcli.adapters.files import need_output
-from relightcli.errors import InputError
+from relightcli.errors import InputError, StoreError
 from relightcli.scene.model import Camera, Geometry, Scene
 from relightcli.scene.moving import apply_moves
 from relightcli.scene.posing import resolve_poses
@@ -89,8 +89,11 @@ def _same_file(a: str | Path, b: str | Path) -> bool:
     return os.path.exists(a) and os.path.exists(b) and os.path.samefile(a, b)
 
 
-def check_shots(config: Config, shots: list[Shot], scene: Scene) -> None:
-    """Look at every frame before the first is made. Raises InputError, naming the keyframe file and the frame."""
+def check_shots(config: Config, shots: list[Shot], scene: Scene, only: str | None = None) -> None:
+    """Look at every frame before the first is made. `only`: the one camera that the store has light for.
+
+    Raises InputError, and StoreError for another camera, naming the keyframe file and the frame.
+    """
     for shot in shots:
         try:
             apply_settings(scene.materials, shot.settings)
@@ -98,10 +101,15 @@ def check_shots(config: Config, shots: list[Shot], scene: Scene) -> None:
             resolve_environment(shot.env, scene.environments)
             if shot.camera is not None:
                 resolve_camera(shot.camera, scene.cameras)
-        except InputError as error:
+                if only not in (None, shot.camera):
+                    raise StoreError(
+                        f"--camera {shot.camera}: the store's receivers are the pixels of camera {only!r}; "
+                        "precompute with --receivers vertices for other views"
+                    )
+        except (InputError, StoreError) as error:
             if config.frames is None:
                 raise
-            raise InputError(f"{config.frames}: frame {shot.number}: {error}") from None
+            raise type(error)(f"{config.frames}: frame {shot.number}: {error}") from None
 
 
 def check_poses(config: Config, shots: list[Shot], scene: Scene, geometry: Geometry) -> list[str]:

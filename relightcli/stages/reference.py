@@ -26,7 +26,7 @@ from relightcli.scene.parse import load_scene
 from relightcli.scene.posing import apply_poses
 from relightcli.scene.settings import apply_settings
 from relightcli.stages.inputs import scene_inputs
-from relightcli.stages.lighting import read_scene
+from relightcli.stages.lighting import described, need_scene, read_scene, whole_setting
 from relightcli.stages.outputs import (
     Config,
     check_poses,
@@ -37,6 +37,7 @@ from relightcli.stages.outputs import (
     resolve_camera,
     resolve_environment,
 )
+from relightcli.stages.precompute_config import MOST_BOUNCES
 from relightcli.stages.shots import Shot
 
 PATHS_PER_BLOCK = 8_000_000
@@ -44,7 +45,7 @@ PATHS_PER_BLOCK = 8_000_000
 
 @dataclass(frozen=True)
 class ReferenceJob:
-    """Rows of one picture. `source` is a transfer store or a scene file."""
+    """Rows of one picture. `source` is a store or a scene file."""
 
     partial: str
     source: str
@@ -101,12 +102,14 @@ class ReferenceWorker:
 
 
 def open_source(path: Path, allow_outside: bool = False) -> tuple[Scene, Geometry, str, int]:
-    """Scene, geometry, fingerprint and interreflections of a transfer store, or of a scene file (.toml; 0)."""
+    """Scene, geometry, fingerprint and interreflections of any stage's store, or of a scene file (.toml; 0)."""
     if path.suffix.lower() == ".toml":
         scene = load_scene(path, allow_outside=allow_outside)
         return scene, build_geometry(scene), formats.fingerprint_json(scene_inputs(scene)), 0
-    store = formats.open_store(path, "transfer")
-    return *read_scene(store), store.fingerprint, int(store.settings["bounces"])
+    store = formats.open_store(path)
+    need_scene(store)
+    with described(store.path):
+        return *read_scene(store), store.fingerprint, whole_setting(store, "bounces", 0, MOST_BOUNCES)
 
 
 def render_reference(config: Config, shots: list[Shot], suffix: str, started: float) -> dict[str, Any]:

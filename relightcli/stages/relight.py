@@ -45,7 +45,7 @@ def relight(config: Config) -> dict[str, Any]:
 
         return render_reference(config, shots, suffix, started)
     lighting = open_lighting(config.store, config.workers)
-    check_shots(config, shots, lighting.scene)
+    check_shots(config, shots, lighting.scene, lighting.camera_name)
     if config.suns == "traced":
         lighting.trace_suns()
     for shot in shots:

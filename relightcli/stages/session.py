@@ -20,7 +20,7 @@ from relightcli.adapters.rays import Tracer
 from relightcli.core.lights.latlong import lookup_many, make_latlong
 from relightcli.core.shade import picture, primary
 from relightcli.core.transport.camera import film_directions, make_film
-from relightcli.errors import InputError, NumericalError
+from relightcli.errors import NumericalError
 from relightcli.scene.model import Camera, Material
 from relightcli.scene.settings import apply_settings
 from relightcli.stages.lighting import LightingStore, Radiance, together
@@ -149,11 +149,6 @@ class Session:
     def _view(self, name: str | None) -> _View:
         lighting = self.lighting
         if lighting.camera_name is not None:
-            if name not in (None, lighting.camera_name):
-                raise InputError(
-                    f"--camera {name}: the store's receivers are the pixels of camera {lighting.camera_name!r}; "
-                    "precompute with --receivers vertices for other views"
-                )
             name = lighting.camera_name
         camera = resolve_camera(name, lighting.scene.cameras)
         if camera.name not in self._views:

@@ -46,6 +46,12 @@ def test_json_is_one_object(files):
     assert answer["items"][0]["percent_beyond"] == {"rmse": 100.0, "psnr": 100.0}
 
 
+def test_quiet_prints_nothing_but_answers_by_exit_code_and_json(files):
+    answer = CliRunner().invoke(command, [*files, "-q"])
+    assert (answer.exit_code, answer.output) == (1, "")
+    assert json.loads(CliRunner().invoke(command, [*files, "-q", "-v", "--json"]).stdout)["passed"] is False
+
+
 def test_text_says_what_failed(files):
     result = CliRunner().invoke(command, [*files, "--fail", "0.005"])
     assert result.stdout == (
