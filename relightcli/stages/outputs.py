@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Callable
@@ -53,6 +54,7 @@ class Config:
     overwrite: bool = False
     allow_outside: bool = False
     dry_run: bool = False
+    tolerance: float | None = None
     quiet: bool = False
 
 
@@ -80,6 +82,8 @@ def check(config: Config, suffix: str) -> None:
         raise InputError(f"--reference makes pictures; expected one of {', '.join(PICTURES)}; found {config.output}")
     if not np.isfinite(config.env_rotate) or not np.isfinite(config.exposure):
         raise InputError("--env-rotate and --exposure: expected finite numbers")
+    if config.tolerance is not None and not 0.0 < config.tolerance < math.inf:
+        raise InputError(f"--tolerance: expected a number above 0; found {config.tolerance}")
     for name, path in (("the store", config.store), ("--env", config.env), ("--from", config.previous)):
         if path is not None and _same_file(config.output, path):
             raise InputError(f"--output {config.output}: is {name} itself; expected another name")
@@ -179,6 +183,19 @@ def resolve_camera(name: str | None, cameras: dict[str, Camera]) -> Camera:
     if name not in cameras:
         raise InputError(f"--camera {name}: not in the scene; it has {', '.join(cameras) or 'none'}")
     return cameras[name]
+
+
+def plan_frames(config: Config, shots: list[Shot], scene: Scene) -> list[dict[str, Any]]:
+    """What every frame would be written as, for --dry-run."""
+    return [
+        {
+            "output": numbered(config.output, shot.number) if config.frames else config.output,
+            "environment": str(resolve_environment(shot.env, scene.environments)),
+            "env_rotate": shot.env_rotate,
+            "set": list(shot.settings),
+        }
+        for shot in shots
+    ]
 
 
 def put_picture(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from relightcli.adapters.flip import flip_hdr
 from relightcli.adapters.images import read_image, write_image
 from relightcli.core.brdf.models import evaluate_many, pack_materials
 from relightcli.core.measure.errors import relative_rmse
-from relightcli.errors import InputError, StoreError
+from relightcli.errors import InputError, NumericalError, StoreError
 from relightcli.scene.model import Camera, Material
 from relightcli.stages.outputs import numbered
 from relightcli.stages.relight import Config, relight
@@ -162,7 +164,10 @@ def test_radiance_store(scene, store, tmp_path):
     assert radiance.shape[0] == 1
     assert radiance.shape[1:] == (len(found.read("receivers/position")), 3)
     assert (radiance >= 0).all()
-    run(store, tmp_path / "a.zarr")  # up to date
+    root = tmp_path / "a.zarr" / "zarr.json"
+    os.utime(root, (0, 0))
+    assert run(store, tmp_path / "a.zarr")["status"] == "up to date"
+    assert root.stat().st_mtime > 0  # refreshed, for Make
     with pytest.raises(StoreError):
         run(store, tmp_path / "a.zarr", env_rotate=5.0)
     with pytest.raises(StoreError):
@@ -248,6 +253,24 @@ def test_pixel_stores_have_one_camera(scene, tmp_path):
     assert not list(tmp_path.glob("a.*.exr"))
     with pytest.raises(StoreError, match="not vertices"):
         run(store, tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("reference", [False, True])
+def test_a_dry_run_predicts_and_leaves_nothing(store, tmp_path, reference):
+    told = run(store, tmp_path / "a.exr", reference=reference, spp=64, dry_run=True)
+    assert told["frames"][0]["output"] == str(tmp_path / "a.exr")
+    assert told["predicted"]["seconds"] > 0
+    assert not list(tmp_path.iterdir())
+
+
+def test_tolerance_of_a_reference_is_its_noise(store, tmp_path):
+    with pytest.raises(NumericalError, match=r"the noise is .* at 4 samples .*; --spp \d+ should do; nothing was"):
+        run(store, tmp_path / "a.exr", reference=True, spp=4, tolerance=0.01, camera="side")
+    assert not (tmp_path / "a.exr").exists()
+    run(store, tmp_path / "a.exr", reference=True, spp=4, tolerance=0.9, camera="side", overwrite=True)
+    with pytest.raises(InputError, match="--tolerance: expected a number above 0"):
+        run(store, tmp_path / "a.exr", tolerance=float("nan"))
+    assert any("was not measured" in note for note in run(store, tmp_path / "a.exr", tolerance=0.1)["notes"])
 
 
 def test_not_a_store(tmp_path):
