@@ -36,9 +36,11 @@ if TYPE_CHECKING:
     metavar="P",
     help="Fail only if more than P percent of the pixels are, each by itself, beyond the threshold.",
 )
+@click.option("--tolerance", type=click.FloatRange(0), metavar="X", help="The same as --fail relrmse=X.")
 @click.option("--heatmap", type=options.PATH, help="Write the first metric per pixel as a picture.")
 @click.option("--report", type=options.PATH, help="Write one self-contained HTML page.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout, and nothing else.")
+@click.option("--dry-run", is_flag=True, help="Name what would be compared; do nothing.")
+@options.report
 @click.pass_context
 def command(
     context: click.Context,
@@ -47,9 +49,13 @@ def command(
     metrics: tuple[str, ...],
     fail: tuple[str, ...],
     fail_percent: float | None,
+    tolerance: float | None,
     heatmap: Path | None,
     report: Path | None,
+    dry_run: bool,
     as_json: bool,
+    quiet: bool,
+    verbose: bool,
 ) -> None:
     """Measure A, the test, against B, the reference.
 
@@ -57,14 +63,22 @@ def command(
     exit code is 0 within the thresholds and 1 beyond; NaN or infinity in a picture always fails. Pictures of different
     size or channels are an error, code 2.
     """
-    from relightcli.stages.diff import diff
+    from relightcli.stages.diff import diff, plan
     from relightcli.stages.diff_result import DiffSettings, parse_thresholds
 
+    if tolerance is not None:
+        metrics, fail = (*metrics, "relrmse"), (*fail, f"relrmse={tolerance!r}")
     # Asking twice is asking once.
     metrics = tuple(dict.fromkeys(metrics)) or ("relrmse",)
     settings = DiffSettings(metrics, parse_thresholds(fail, metrics), fail_percent, heatmap, report)
+    if dry_run:
+        planned = plan(a, b)
+        text = [f"{name}: {options.bytes_text(size)}" for name, size in planned["items"].items()]
+        options.tell(planned, "\n".join([f"would compare, of kind {planned['kind']}:", *text]), as_json, quiet)
+        return
     result = diff(a, b, settings)
-    click.echo(json.dumps(result.to_json()) if as_json else _text(result))
+    if as_json or not quiet:
+        click.echo(json.dumps(result.to_json()) if as_json else _text(result))
     context.exit(0 if result.passed else 1)
 
 

@@ -11,6 +11,8 @@ from urllib.parse import unquote, urlsplit
 
 import click
 
+from relightcli import __version__
+
 Command = Callable[..., Any]
 SEED = click.IntRange(0, 2**63 - 1)
 # What may not be read is a system error (5), not bad usage (2); the stages say so.
@@ -81,7 +83,8 @@ def overwrite(command: Command) -> Command:
 
 
 def report(command: Command) -> Command:
-    """--json, -q, -v."""
+    """--json, -q, -v, --version."""
+    command = click.version_option(__version__, prog_name="relightcli")(command)
     command = click.option("-v", "--verbose", is_flag=True, help="Show tracebacks and details.")(command)
     command = click.option("-q", "--quiet", is_flag=True, help="No progress, no summary.")(command)
     return click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout, nothing else.")(command)

@@ -71,6 +71,12 @@ from relightcli.cli import options
     help="Shadows of what moves in the light of small bright places of the sky: by fields, or by rays.",
 )
 @click.option("--seed", default=0, type=options.SEED, help="Seed of --reference.")
+@click.option(
+    "--tolerance",
+    default=None,
+    type=float,
+    help="Relative RMS error that is accepted: of the store, as it was measured, or the noise of --reference.",
+)
 @click.option("--allow-outside", is_flag=True, help="Let a scene file use files outside its folder.")
 @click.option("--dry-run", is_flag=True, help="Say what would be written; do nothing.")
 @options.workers
@@ -118,8 +124,13 @@ def _text(result: dict[str, Any]) -> str:
     lines = [f"note: {note}" for note in result["notes"]]
     if result.get("dry_run"):
         lines += [f"{f['output']}: {f['environment']} turned by {f['env_rotate']:g} degrees" for f in result["frames"]]
+        cost = result["predicted"]
+        rays = f"{cost['rays'] / 1e6:.1f} million rays, " if "rays" in cost else ""
+        lines.append(f"predicted {rays}{cost['seconds']:.1f} s")
         return "\n".join(lines)
     output = result["output"]
+    if result.get("status") == "up to date":
+        return "\n".join([*lines, f"{output} is up to date"])
     name = output if isinstance(output, str) else f"{output[0]} .. {output[-1]}"
     if result.get("reference"):
         lines.append(f"{name}: {result['spp']} samples a pixel, {result['seconds']:.1f} s")

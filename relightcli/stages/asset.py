@@ -26,7 +26,7 @@ from relightcli.core.shade.irradiance import irradiance, moment_prefix
 from relightcli.core.shade.low_order import response, shade_low_order
 from relightcli.core.transport.channels import SHINY, coefficients, plan_channels
 from relightcli.core.transport.transfer import even_projection, local_rotations
-from relightcli.errors import InputError
+from relightcli.errors import InputError, StoreError
 from relightcli.scene.model import Material
 from relightcli.stages.direct_tensors import DirectTensors
 from relightcli.stages.lighting import LightingStore, Radiance, _Coats
@@ -67,11 +67,11 @@ class AssetStore(LightingStore):
         basis: str | None = None,
         bounces: int | None = None,
     ) -> list[Radiance]:
-        """See `LightingStore.exit_radiance`. Raises InputError for more interreflections than the asset has, and for a
-        material that has become another model than its tensors were made for."""
+        """See `LightingStore.exit_radiance`. Raises StoreError for more interreflections than the asset has, InputError
+        for a material that has become another model than its tensors were made for."""
         bounces = self.bounces if bounces is None else bounces
         if bounces > self.bounces:
-            raise InputError(f"--bounces {bounces}: the asset has {self.bounces}; use the transfer store it came from")
+            raise StoreError(f"--bounces {bounces}: the asset has {self.bounces}; use the transfer store it came from")
         coats = self._coats_of(materials)
         if basis is None and coats.shiny.any() and view is None:
             raise InputError("a material with a specular lobe looks different from everywhere: name a --camera")

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,22 @@ def diff(a: str | Path, b: str | Path, settings: DiffSettings) -> DiffResult:
     if kind == "store":
         return _diff_stores(a, b, settings)
     return _diff_pictures(kind, a, b, _pairs(a, b) if kind == "sequence" else {a.name: (a, b)}, settings)
+
+
+def plan(a: str | Path, b: str | Path) -> dict[str, Any]:
+    """What `diff` would compare: the kind, and of every pair its name and the bytes to read. Raises as `diff`."""
+    a, b = (path if isinstance(path, Path) else Path(path) for path in (a, b))
+    kind = _kind(a)
+    if _kind(b) != kind:
+        raise InputError(f"{a} is a {kind} and {b} a {_kind(b)}; expected two of a kind.")
+    if kind == "store":
+        from relight_formats import open_store
+
+        items = {a.name: sum(size.stored for path in (a, b) for size in open_store(path).sizes().values())}
+    else:
+        pairs = _pairs(a, b) if kind == "sequence" else {a.name: (a, b)}
+        items = {name: sum(path.stat().st_size for path in pair) for name, pair in pairs.items()}
+    return {"command": "diff", "dry_run": True, "kind": kind, "a": str(a), "b": str(b), "items": items, "notes": []}
 
 
 def _diff_stores(a: Path, b: Path, settings: DiffSettings) -> DiffResult:

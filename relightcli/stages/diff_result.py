@@ -29,6 +29,10 @@ class DiffSettings:
         """The threshold of a metric; by default any difference fails."""
         return self.fail.get(metric, math.inf if metric == "psnr" else 0.0)
 
+    def judges(self, metric: str) -> bool:
+        """Whether a metric can fail: those with a threshold, or all where none has one."""
+        return not self.fail or metric in self.fail
+
     @property
     def exact(self) -> bool:
         """No difference whatsoever is let through, layers and alpha included."""
@@ -85,7 +89,7 @@ class DiffResult:
             "a": self.a,
             "b": self.b,
             "passed": self.passed,
-            "fail": {metric: _number(settings.threshold(metric)) for metric in settings.metrics},
+            "fail": {m: _number(settings.threshold(m)) if settings.judges(m) else None for m in settings.metrics},
             "fail_percent": settings.fail_percent,
             "worst": self.worst().name,
             "heatmap": str(settings.heatmap) if settings.heatmap else None,
@@ -136,6 +140,8 @@ def judge(values: Mapping[str, float], percent: Mapping[str, float], settings: D
         return [] if equal else ["differs; expected no difference, because no --fail was given."]
     reasons = []
     for metric, value in values.items():
+        if not settings.judges(metric):
+            continue
         limit = settings.threshold(metric)
         if settings.fail_percent is not None:
             if percent[metric] > settings.fail_percent:

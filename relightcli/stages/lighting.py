@@ -98,6 +98,20 @@ def read_scene(store: formats.Store) -> tuple[Scene, Geometry]:
     return scene, geometry
 
 
+def need_scene(store: formats.Store) -> None:
+    """Raises StoreError for a store that no picture is made from."""
+    if store.kind not in KINDS:
+        raise StoreError(f"{store.path}: expected a store of kind {' or '.join(KINDS)}, found {store.kind}.")
+
+
+def whole_setting(store: formats.Store, name: str, low: int, high: int) -> int:
+    """A setting of the store, which may be a stranger's."""
+    value = store.settings[name]
+    if type(value) is not int or not low <= value <= high:
+        raise ValueError(f"settings.{name}: expected {low} to {high}, found {value!r}")
+    return value
+
+
 def need_still(store: formats.Store) -> None:
     """Raises StoreError for a store whose objects may be moved, which a stage would take for parts of the rest."""
     if "fields" in store.attrs:
@@ -129,10 +143,7 @@ class LightingStore:
 
     def __init__(self, store: Path | formats.Store, threads: int) -> None:
         self.store = formats.open_store(store) if isinstance(store, Path) else store
-        if self.store.kind not in KINDS:
-            raise StoreError(
-                f"{self.store.path}: expected a store of kind {' or '.join(KINDS)}, found {self.store.kind}."
-            )
+        need_scene(self.store)
         self.threads = threads
         with described(self.store.path):
             self._open()
@@ -145,11 +156,11 @@ class LightingStore:
         self.object: NDArray[np.int32] = read("receivers/object")
         self.side: NDArray[np.int8] = read("receivers/side")
         self.vertex: NDArray[np.int32] | None = read("receivers/vertex") if "receivers/vertex" in self.store else None
-        self.resolution = self._whole("light_resolution", 1, MOST_RESOLUTION)
+        self.resolution = whole_setting(self.store, "light_resolution", 1, MOST_RESOLUTION)
         self.basis: str = self.store.settings["basis"]
         if self.basis not in BASES:
             raise ValueError(f"settings.basis: expected one of {', '.join(BASES)}, found {self.basis!r}")
-        self.bounces = self._whole("bounces", 0, MOST_BOUNCES)
+        self.bounces = whole_setting(self.store, "bounces", 0, MOST_BOUNCES)
         if not isinstance(self.store.settings["receivers"], str):
             raise TypeError("settings.receivers: expected a text")
         # Receivers of pixels, which come first; those on vertices, if any, follow.
@@ -164,13 +175,6 @@ class LightingStore:
             if layout.raw_bytes <= IN_MEMORY:  # decoded beside the making of the first view
                 self._bits = ThreadPoolExecutor(1).submit(read, "visibility/bits")
             self._chunk = layout.chunks[0]
-
-    def _whole(self, name: str, low: int, high: int) -> int:
-        """A setting of the store, which may be a stranger's."""
-        value = self.store.settings[name]
-        if type(value) is not int or not low <= value <= high:
-            raise ValueError(f"settings.{name}: expected {low} to {high}, found {value!r}")
-        return value
 
     def __len__(self) -> int:
         return len(self.position)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Callable
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from relightcli.adapters import images
 from relightcli.adapters.files import need_output
-from relightcli.errors import InputError
+from relightcli.errors import InputError, StoreError
 from relightcli.scene.model import Camera, Geometry, Scene
 from relightcli.scene.moving import apply_moves
 from relightcli.scene.posing import resolve_poses
@@ -53,6 +54,7 @@ class Config:
     overwrite: bool = False
     allow_outside: bool = False
     dry_run: bool = False
+    tolerance: float | None = None
     quiet: bool = False
 
 
@@ -80,6 +82,8 @@ def check(config: Config, suffix: str) -> None:
         raise InputError(f"--reference makes pictures; expected one of {', '.join(PICTURES)}; found {config.output}")
     if not np.isfinite(config.env_rotate) or not np.isfinite(config.exposure):
         raise InputError("--env-rotate and --exposure: expected finite numbers")
+    if config.tolerance is not None and not 0.0 < config.tolerance < math.inf:
+        raise InputError(f"--tolerance: expected a number above 0; found {config.tolerance}")
     for name, path in (("the store", config.store), ("--env", config.env), ("--from", config.previous)):
         if path is not None and _same_file(config.output, path):
             raise InputError(f"--output {config.output}: is {name} itself; expected another name")
@@ -89,8 +93,11 @@ def _same_file(a: str | Path, b: str | Path) -> bool:
     return os.path.exists(a) and os.path.exists(b) and os.path.samefile(a, b)
 
 
-def check_shots(config: Config, shots: list[Shot], scene: Scene) -> None:
-    """Look at every frame before the first is made. Raises InputError, naming the keyframe file and the frame."""
+def check_shots(config: Config, shots: list[Shot], scene: Scene, only: str | None = None) -> None:
+    """Look at every frame before the first is made. `only`: the one camera that the store has light for.
+
+    Raises InputError, and StoreError for another camera, naming the keyframe file and the frame.
+    """
     for shot in shots:
         try:
             apply_settings(scene.materials, shot.settings)
@@ -98,10 +105,15 @@ def check_shots(config: Config, shots: list[Shot], scene: Scene) -> None:
             resolve_environment(shot.env, scene.environments)
             if shot.camera is not None:
                 resolve_camera(shot.camera, scene.cameras)
-        except InputError as error:
+                if only not in (None, shot.camera):
+                    raise StoreError(
+                        f"--camera {shot.camera}: the store's receivers are the pixels of camera {only!r}; "
+                        "precompute with --receivers vertices for other views"
+                    )
+        except (InputError, StoreError) as error:
             if config.frames is None:
                 raise
-            raise InputError(f"{config.frames}: frame {shot.number}: {error}") from None
+            raise type(error)(f"{config.frames}: frame {shot.number}: {error}") from None
 
 
 def check_poses(config: Config, shots: list[Shot], scene: Scene, geometry: Geometry) -> list[str]:
@@ -171,6 +183,19 @@ def resolve_camera(name: str | None, cameras: dict[str, Camera]) -> Camera:
     if name not in cameras:
         raise InputError(f"--camera {name}: not in the scene; it has {', '.join(cameras) or 'none'}")
     return cameras[name]
+
+
+def plan_frames(config: Config, shots: list[Shot], scene: Scene) -> list[dict[str, Any]]:
+    """What every frame would be written as, for --dry-run."""
+    return [
+        {
+            "output": numbered(config.output, shot.number) if config.frames else config.output,
+            "environment": str(resolve_environment(shot.env, scene.environments)),
+            "env_rotate": shot.env_rotate,
+            "set": list(shot.settings),
+        }
+        for shot in shots
+    ]
 
 
 def put_picture(

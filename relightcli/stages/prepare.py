@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from relightcli.adapters.rays import Tracer
 from relightcli.core.transport.receivers import Receivers
 from relightcli.core.transport.shading import shading_scene
+from relightcli.core.transport.smooth_cuts import cut_for_shading
 from relightcli.core.transport.tessellation import tessellate
 from relightcli.errors import InputError
 from relightcli.plan import effects, pilot
 from relightcli.run.accounting import Account
 from relightcli.scene.build import build_geometry
-from relightcli.scene.model import Geometry, Scene
+from relightcli.scene.model import Geometry, Material, Scene
 from relightcli.scene.parse import load_scene
 from relightcli.stages.fields import Moving, add_points, find_movers, place, without
 from relightcli.stages.inputs import named_files, stamps
@@ -162,8 +163,8 @@ def prepare(config: Config, account: Account) -> Prepared:
     with account.step("reading"):
         moving = _moving(config, scene) if fields.simulate else None
         uncut = source
-        if shadows and config.subdivide and (config.receivers == "vertices" or bounce_cells):
-            uncut = _subdivided(source, moving)
+        if config.subdivide and (config.receivers == "vertices" or bounce_cells):
+            uncut = _subdivided(scene, source, moving, shadows)
         geometry = uncut if moving is None else place(moving, uncut)
     prepared = Prepared(
         config,
@@ -218,13 +219,20 @@ def _moving(config: Config, scene: Scene) -> Moving:
     return find_movers(scene, config.fields, config.subdivide, config.seed)
 
 
-def _subdivided(geometry: Geometry, moving: Moving | None) -> Geometry:
+def _subdivided(scene: Scene, geometry: Geometry, moving: Moving | None, shadows: bool) -> Geometry:
     movers = () if moving is None else tuple(geometry.object_names.index(m.mesh.name) for m in moving.movers)
-    finer = tessellate(geometry, movers)
+    finer, materials, what = geometry, list(scene.materials.values()), "highlights"
+    eyes = np.array([camera.eye for camera in scene.cameras.values()]).reshape(-1, 3)
+    lights = np.array([light.center for light in scene.lights.values()]).reshape(-1, 3)
+    if shadows:  # faces get small enough for most lobes, but not for the light of a lamp close by
+        finer, what = tessellate(geometry, movers), "shadows"
+        materials, eyes = [Material("")] * len(materials), eyes[:0]
+    if len(lights) or not shadows:
+        finer = cut_for_shading(finer, materials, eyes, lights, movers)
     more = len(finer.positions) - len(geometry.positions)
     if more == 0:
         return geometry
-    note = f"faces too large to carry shadows were cut: {more} more vertices (--no-subdivide keeps them whole)"
+    note = f"faces too large to carry {what} were cut: {more} more vertices (--no-subdivide keeps them whole)"
     return replace(finer, notes=(*geometry.notes, note))
 
 

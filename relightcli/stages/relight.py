@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import relight_formats as formats
+from relightcli.errors import NumericalError
 from relightcli.stages.lighting import LightingStore, described
 from relightcli.stages.outputs import (
     Config,
@@ -14,9 +15,8 @@ from relightcli.stages.outputs import (
     check_moves,
     check_poses,
     check_shots,
-    numbered,
     output_suffix,
-    resolve_environment,
+    plan_frames,
 )
 from relightcli.stages.session import Session
 from relightcli.stages.shots import Shot, read_shots
@@ -45,7 +45,7 @@ def relight(config: Config) -> dict[str, Any]:
 
         return render_reference(config, shots, suffix, started)
     lighting = open_lighting(config.store, config.workers)
-    check_shots(config, shots, lighting.scene)
+    check_shots(config, shots, lighting.scene, lighting.camera_name)
     if config.suns == "traced":
         lighting.trace_suns()
     for shot in shots:
@@ -57,16 +57,19 @@ def relight(config: Config) -> dict[str, Any]:
     check_moves(config, shots, lighting.set_moves)
     if config.previous is not None:
         lighting.resume(config.previous)
-    if config.dry_run:
-        return _plan(config, shots, lighting)
-    session = Session(lighting, config)
-    opened = time.perf_counter() - started
     written, clocks = [], []
-    for shot in shots:
-        clock = time.perf_counter()
-        written.append(session.write(shot, suffix))
-        clocks.append(time.perf_counter() - clock)
-    session.finish()
+    with Session(lighting, config) as session:
+        session.notes += need_accuracy(config, lighting.store)
+        if config.dry_run:
+            return _plan(session, shots, suffix, time.perf_counter() - started)
+        if not session.begin(shots):
+            return {"store": str(config.store), "output": config.output, "status": "up to date", "notes": []}
+        opened = time.perf_counter() - started
+        for shot in shots:
+            clock = time.perf_counter()
+            written.append(session.write(shot, suffix))
+            clocks.append(time.perf_counter() - clock)
+        session.finish()
     costs = lighting.costs()
     return {
         "store": str(config.store),
@@ -114,15 +117,41 @@ def _of_kind(store: formats.Store, threads: int) -> LightingStore:
     return LightingStore(store, threads)
 
 
-def _plan(config: Config, shots: list[Shot], lighting: LightingStore) -> dict[str, Any]:
-    """What a run would write, with everything that can be wrong looked at, and nothing done."""
-    frames = [
-        {
-            "output": numbered(config.output, shot.number) if config.frames else config.output,
-            "environment": str(resolve_environment(shot.env, lighting.scene.environments)),
-            "env_rotate": shot.env_rotate,
-            "set": list(shot.settings),
-        }
-        for shot in shots
-    ]
-    return {"dry_run": True, "store": str(config.store), "receivers": len(lighting), "frames": frames, "notes": []}
+def _plan(session: Session, shots: list[Shot], suffix: str, opened: float) -> dict[str, Any]:
+    """What a run would write and what it should take, from the first frame's light; nothing is left behind."""
+    config, lighting = session.config, session.lighting
+    clock = time.perf_counter()
+    session.light(shots[0], suffix)  # what the first frame makes for those after it, and what compiles
+    first = time.perf_counter() - clock
+    clock = time.perf_counter()
+    session.light(shots[-1], suffix)
+    more = time.perf_counter() - clock
+    return {
+        "dry_run": True,
+        "store": str(config.store),
+        "receivers": len(lighting),
+        "frames": plan_frames(config, shots, lighting.scene),
+        "predicted": {"seconds": opened + first + (len(shots) - 1) * more},
+        "notes": session.notes,
+    }
+
+
+def need_accuracy(config: Config, store: formats.Store) -> list[str]:
+    """Notes on what is known of the store's error. Raises NumericalError where it is above the tolerance."""
+    if config.tolerance is None:
+        return []
+    measured = store.attrs.get("measured_error")
+    if measured is None:
+        return [
+            "--tolerance: the store's error was not measured; precompute --tolerance does, and so do --reference "
+            "and diff"
+        ]
+    share = float(measured["share"])
+    if share > config.tolerance:
+        raise NumericalError(
+            f"{store.path}: its error was measured as {share:.2%}, above --tolerance {config.tolerance:.2%}; "
+            f"nothing was written. precompute --tolerance {config.tolerance:g}, or use --reference"
+        )
+    if store.kind == "transfer":
+        return []
+    return [f"--tolerance: {share:.2%} was measured of the transfer store; what came after it is not in that"]

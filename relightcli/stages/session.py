@@ -7,12 +7,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
+from types import TracebackType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import relight_formats as formats
+from relight_formats.publish import discard
 from relightcli import __version__
 from relightcli.adapters import images
 from relightcli.adapters.ply import write_ply
@@ -20,9 +22,11 @@ from relightcli.adapters.rays import Tracer
 from relightcli.core.lights.latlong import lookup_many, make_latlong
 from relightcli.core.shade import picture, primary
 from relightcli.core.transport.camera import film_directions, make_film
-from relightcli.errors import InputError, NumericalError
+from relightcli.errors import NumericalError
+from relightcli.run.accounting import Account, Meter
 from relightcli.scene.model import Camera, Material
 from relightcli.scene.settings import apply_settings
+from relightcli.stages.budget import summary
 from relightcli.stages.lighting import LightingStore, Radiance, together
 from relightcli.stages.outputs import (
     PICTURES,
@@ -60,7 +64,6 @@ class Session:
         self.notes: list[str] = []
         self._views: dict[str, _View] = {}
         self._tracer: Tracer | None = None
-        self._maps: dict[str, str] = {}
         self._map: tuple[Path, NDArray[np.float32]] | None = None
         self._radiance: list[NDArray[np.float32]] = []
         self._last: tuple[object, ...] = ()
@@ -68,8 +71,11 @@ class Session:
         self._moves: tuple[str, ...] | None = None
         self._positions: list[NDArray[np.float64]] = []
         self._seconds: dict[str, list[float]] = {}
+        self._writer: formats.Writer | None = None
+        self._started, self._meter = time.perf_counter(), Meter()
 
-    def write(self, shot: Shot, suffix: str) -> str:
+    def light(self, shot: Shot, suffix: str) -> tuple[_View | None, NDArray[np.float32], list[Radiance]]:
+        """One frame's view, where the output is a picture, its environment, and the receivers' light in parts."""
         self._pose(shot.poses)
         self._move(shot.moves)
         materials = apply_settings(self.lighting.scene.materials, shot.settings)
@@ -78,13 +84,19 @@ class Session:
                 reading = reader.submit(self._environment, shot)
                 view = self._view(shot.camera)
                 environment = reading.result()
-            return self._write_picture(shot, suffix, view, environment, materials)
+            return view, environment, self._light(shot, environment, materials, view.towards, view.active)
         environment = self._environment(shot)
         towards = None
         if self.lighting.scene.cameras:
             eye = np.array(resolve_camera(shot.camera, self.lighting.scene.cameras).eye)
             towards = _towards(eye, self.lighting.position)
-        radiance = together(self._light(shot, environment, materials, towards, None))
+        return None, environment, self._light(shot, environment, materials, towards, None)
+
+    def write(self, shot: Shot, suffix: str) -> str:
+        view, environment, parts = self.light(shot, suffix)
+        if view is not None:
+            return self._write_picture(shot, suffix, view, environment, parts)
+        radiance = together(parts)
         total = radiance.diffuse if radiance.specular is None else radiance.diffuse + radiance.specular
         if suffix == ".ply":
             return self._write_ply(shot, total)
@@ -116,8 +128,6 @@ class Session:
             radiance, notes = images.read_environment_with_notes(path)
             self.notes.extend(n for n in notes if n not in self.notes)
             self._map = (path, radiance)
-            if self.config.output.endswith(".zarr"):
-                self._maps[str(path)] = formats.fingerprint_file(path)
         return self._map[1]
 
     def _light(
@@ -149,11 +159,6 @@ class Session:
     def _view(self, name: str | None) -> _View:
         lighting = self.lighting
         if lighting.camera_name is not None:
-            if name not in (None, lighting.camera_name):
-                raise InputError(
-                    f"--camera {name}: the store's receivers are the pixels of camera {lighting.camera_name!r}; "
-                    "precompute with --receivers vertices for other views"
-                )
             name = lighting.camera_name
         camera = resolve_camera(name, lighting.scene.cameras)
         if camera.name not in self._views:
@@ -185,10 +190,9 @@ class Session:
         return _View(camera, matrix, samples.coverage, matrix.used(len(lighting)), towards)
 
     def _write_picture(
-        self, shot: Shot, suffix: str, view: _View, environment: NDArray[np.float32], materials: dict[str, Material]
+        self, shot: Shot, suffix: str, view: _View, environment: NDArray[np.float32], parts: list[Radiance]
     ) -> str:
         width, height = view.camera.size
-        parts = self._light(shot, environment, materials, view.towards, view.active)
         threads = self.config.workers
         layers = {}
         if self.config.layers:
@@ -247,15 +251,17 @@ class Session:
         write_ply(name, geometry.positions[:count], faces, colours, shot.exposure)
         return name
 
-    def finish(self) -> None:
-        """Writes the radiance store, if that is what was asked for."""
-        if not self._radiance:
-            return
-        config, store = self.config, self.lighting.store
-        radiance = np.stack(self._radiance)
-        _need_finite(radiance, str(config.store))
+    def begin(self, shots: list[Shot]) -> bool:
+        """Starts the radiance store, if that is asked for. False: it is there, made from the same, and up to date.
+
+        Raises StoreError where one made from others is there, or another run is making one.
+        """
+        config = self.config
+        if not config.output.endswith(".zarr"):
+            return True
+        maps = {resolve_environment(shot.env, self.lighting.scene.environments) for shot in shots}
         previous = {} if config.previous is None else {"previous": formats.open_store(config.previous).fingerprint}
-        writer = formats.begin(
+        self._writer = formats.begin(
             config.output,
             "radiance",
             settings={
@@ -270,21 +276,46 @@ class Session:
                 **({} if config.suns == "soft" else {"suns": config.suns}),
                 **({"move": list(config.moves)} if config.moves else {}),
             },
-            inputs={"store": store.fingerprint, **self._maps, **previous},
+            inputs={
+                "store": self.lighting.store.fingerprint,
+                **{str(path): formats.fingerprint_file(path) for path in sorted(maps)},
+                **previous,
+            },
             program=f"relightcli {__version__}",
             overwrite=config.overwrite,
         )
+        return self._writer is not None
+
+    def finish(self) -> None:
+        """Writes the radiance store, if that is what was asked for."""
+        writer = self._writer
         if writer is None:
             return
-        with writer:
-            writer.put("radiance", radiance, dims=("frame", "receiver", "colour"), units="W sr-1 m-2")
-            if self._poses is None and self._moves is None:
-                writer.put("receivers/position", self.lighting.position, dims=("receiver", "axis"), units="m")
-            else:
-                posed = np.stack(self._positions)
-                writer.put("receivers/position", posed, dims=("frame", "receiver", "axis"), units="m")
-            self.lighting.put_light(writer)
-            writer.commit({})
+        radiance = np.stack(self._radiance)
+        _need_finite(radiance, str(self.config.store))
+        writer.put("radiance", radiance, dims=("frame", "receiver", "colour"), units="W sr-1 m-2")
+        if self._poses is None and self._moves is None:
+            writer.put("receivers/position", self.lighting.position, dims=("receiver", "axis"), units="m")
+        else:
+            posed = np.stack(self._positions)
+            writer.put("receivers/position", posed, dims=("frame", "receiver", "axis"), units="m")
+        self.lighting.put_light(writer)
+        account = Account()
+        account.steps["light"] = self._meter.read()
+        writer.commit(summary(account, self._started, False, self.config.workers, self.lighting.store))
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Lets the radiance store go; of one that was not finished nothing is of use to the next run."""
+        if self._writer is None:
+            return
+        if error is not None:
+            discard(Path(self.config.output), self._writer.partial_path)
+        self._writer.close()
 
 
 def environment_behind(environment: NDArray[np.float32], rotate: float, camera: Camera) -> NDArray[np.float32]:

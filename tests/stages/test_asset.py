@@ -200,12 +200,22 @@ def test_interrupted_work_is_continued_with_the_same_bytes(transfer, clusters, a
         assert stage(config)["status"] == "up to date"
 
 
+def test_every_stage_can_be_path_traced(transfer, clusters, asset):
+    options = {"reference": True, "spp": 4, "bounces": 1}
+    truth = layers_of(transfer, "ref-t.exr", **options)
+    for store in (clusters, asset):
+        found = layers_of(store, f"ref-{store.stem}.exr", **options)
+        assert found.keys() == truth.keys()
+        for name in truth:  # the same scene and the same random numbers
+            np.testing.assert_array_equal(found[name], truth[name], err_msg=name)
+
+
 def test_refusals_name_the_way_out(transfer, clusters, asset, tmp_path):
     with pytest.raises(StoreError, match="run cluster first"):
         factorize.factorize(factorize.Config(transfer, tmp_path / "x.zarr"))
     with pytest.raises(StoreError, match="expected a store of kind transfer"):
         cluster.cluster(cluster.Config(clusters, tmp_path / "x.zarr"))
-    with pytest.raises(InputError, match="--bounces 3"):
+    with pytest.raises(StoreError, match="--bounces 3"):
         layers_of(asset, "x.exr", bounces=3)
     with pytest.raises(InputError, match="was made for lambert"):
         layers_of(asset, "x.exr", settings=("ball=gold-paint",))

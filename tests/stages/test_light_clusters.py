@@ -482,6 +482,11 @@ def test_bad_settings(transfer, settings, message):
     assert not (transfer.parent / "bad.zarr").exists()
 
 
+def test_clustered_lights_can_be_path_traced(transfer, clustered):
+    a, b = (picture(store, "traced.exr", reference=True, spp=4) for store in (transfer, clustered))
+    np.testing.assert_array_equal(a, b)
+
+
 def test_other_stores_and_uses_are_refused(transfer, clustered):
     with pytest.raises(StoreError, match="expected a store of kind transfer, found light_clusters"):
         clusters(clustered, "twice.zarr")

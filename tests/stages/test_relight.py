@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 
 import relight_formats as formats
 from relightcli.adapters.flip import flip_hdr
 from relightcli.adapters.images import read_image, write_image
+from relightcli.core.brdf.models import evaluate_many, pack_materials
 from relightcli.core.measure.errors import relative_rmse
-from relightcli.errors import InputError, StoreError
+from relightcli.errors import InputError, NumericalError, StoreError
 from relightcli.scene.model import Camera, Material
 from relightcli.stages.outputs import numbered
 from relightcli.stages.relight import Config, relight
@@ -161,7 +164,10 @@ def test_radiance_store(scene, store, tmp_path):
     assert radiance.shape[0] == 1
     assert radiance.shape[1:] == (len(found.read("receivers/position")), 3)
     assert (radiance >= 0).all()
-    run(store, tmp_path / "a.zarr")  # up to date
+    root = tmp_path / "a.zarr" / "zarr.json"
+    os.utime(root, (0, 0))
+    assert run(store, tmp_path / "a.zarr")["status"] == "up to date"
+    assert root.stat().st_mtime > 0  # refreshed, for Make
     with pytest.raises(StoreError):
         run(store, tmp_path / "a.zarr", env_rotate=5.0)
     with pytest.raises(StoreError):
@@ -238,13 +244,58 @@ def test_refusals(store, tmp_path, output, change, error, message):
 
 def test_pixel_stores_have_one_camera(scene, tmp_path):
     store = make_store(scene, "one.zarr", receivers="pixels:side", light_resolution=16, refine=2)
-    with pytest.raises(InputError, match="pixels of camera 'side'"):
+    with pytest.raises(StoreError, match="pixels of camera 'side'"):
         run(store, tmp_path / "a.exr", camera="main")
+    shots = tmp_path / "shots.toml"
+    shots.write_text('format = 1\nframes = 2\n[[key]]\nframe = 1\ncamera = "side"\n[[key]]\nframe = 2\ncamera = "main"')
+    with pytest.raises(StoreError, match=r"shots\.toml: frame 2: .*pixels of camera 'side'"):
+        run(store, tmp_path / "a.#.exr", frames=shots)
+    assert not list(tmp_path.glob("a.*.exr"))
     with pytest.raises(StoreError, match="not vertices"):
         run(store, tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("reference", [False, True])
+def test_a_dry_run_predicts_and_leaves_nothing(store, tmp_path, reference):
+    told = run(store, tmp_path / "a.exr", reference=reference, spp=64, dry_run=True)
+    assert told["frames"][0]["output"] == str(tmp_path / "a.exr")
+    assert told["predicted"]["seconds"] > 0
+    assert not list(tmp_path.iterdir())
+
+
+def test_tolerance_of_a_reference_is_its_noise(store, tmp_path):
+    with pytest.raises(NumericalError, match=r"the noise is .* at 4 samples .*; --spp \d+ should do; nothing was"):
+        run(store, tmp_path / "a.exr", reference=True, spp=4, tolerance=0.01, camera="side")
+    assert not (tmp_path / "a.exr").exists()
+    run(store, tmp_path / "a.exr", reference=True, spp=4, tolerance=0.9, camera="side", overwrite=True)
+    with pytest.raises(InputError, match="--tolerance: expected a number above 0"):
+        run(store, tmp_path / "a.exr", tolerance=float("nan"))
+    assert any("was not measured" in note for note in run(store, tmp_path / "a.exr", tolerance=0.1)["notes"])
 
 
 def test_not_a_store(tmp_path):
     for path in (tmp_path / "none.zarr", tmp_path):
         with pytest.raises(StoreError):
             run(path, tmp_path / "a.exr")
+
+
+@pytest.mark.parametrize("model", ["cook-torrance", "blinn-phong", "phong"])
+def test_highlights_on_two_large_faces_that_nothing_shadows(tmp_path, model):
+    """A sun of one texel over a ground of two faces, against the reflectance itself."""
+    gloss = Material("gloss", model, (0.1, 0.1, 0.1), (0.5, 0.5, 0.5), f0=0.5, roughness=0.3, shininess=20.0)
+    camera = Camera("main", (0.3, 2.0, 3.0), (0.0, 0.0, 0.0), fov=1.0, size=(2, 2))
+    sun = np.zeros((32, 64, 3), np.float32)
+    sun[6, 1] = 1000.0
+    scene = write_scene(tmp_path, {"ground": square(50.0, material=gloss)}, [camera], {"sun": sun})
+    store = make_store(scene, "t.zarr", light_resolution=16, refine=4)
+    run(store, tmp_path / "a.exr", env="sun")
+    found = read_layers(tmp_path / "a.exr")[""].mean(axis=(0, 1))
+    longitude, latitude = np.pi * (1 - 2 * 1.5 / 64), np.pi * (0.5 - 6.5 / 32)
+    to_sun = [np.sin(longitude) * np.cos(latitude), np.sin(latitude), np.cos(longitude) * np.cos(latitude)]
+    omega = 2 * np.pi / 64 * (np.sin(np.pi * (0.5 - 6 / 32)) - np.sin(np.pi * (0.5 - 7 / 32)))
+    view = np.array(camera.eye) / np.linalg.norm(camera.eye)
+    normal = np.array([0.0, 1.0, 0.0])
+    f = evaluate_many(pack_materials([gloss]), np.array(0), np.full(3, 0.1), normal, np.array(to_sun), view)
+    # The texel of 5.6 degrees is not a point: f is off its mean by the second derivative, (0.05 / 0.3)^2 / 6 = 0.5 %
+    # a side; interpolation adds 2 % at most (core.transport.smooth_cuts). Without cuts it is off by half.
+    np.testing.assert_allclose(found, f * omega * 1000.0, rtol=0.03)

@@ -14,12 +14,14 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from relightcli.scene.model import Geometry
+
+F64 = NDArray[np.float64]
 
 OBJECT_PARTS = 32.0
 NEAR_PARTS = 48.0
@@ -35,10 +37,31 @@ def tessellate(geometry: Geometry, whole: Collection[int] = ()) -> Geometry:
     Where that would take more than MOST_NEW_VERTICES, h is widened until it does not.
     """
     diagonals = _diagonals(geometry)
-    first = _refine(geometry, _Limit(geometry, diagonals, near=False, whole=whole))
-    if len(geometry.object_names) < 2:
-        return first
-    return _refine(first, _Limit(first, diagonals, near=True, whole=whole))
+    finer = refine(geometry, _Limit(geometry, diagonals, near=False, whole=whole))
+    if len(geometry.object_names) > 1:
+        finer = refine(finer, _Limit(finer, diagonals, near=True, whole=whole))
+    return unit_normals(geometry, finer)
+
+
+class Limit(Protocol):
+    """How long edges may be. `floor` (O,): no edge of an object that is shorter is beyond the limit."""
+
+    floor: F64
+
+    def exceeded(self, middle: F64, length: F64, owner: NDArray[np.int32], turn: F64) -> NDArray[np.bool_]:
+        """Of edges by middle (M, 3), length (M,), object (M,) and angle between the ends' normals (M,), rad: beyond?"""
+
+
+def unit_normals(before: Geometry, after: Geometry) -> Geometry:
+    """Normals that `refine` has interpolated, normalised; where they cancelled, some unit vector."""
+    if after is before:
+        return after
+    count = len(before.positions)
+    normals = after.normals.copy()
+    size = np.linalg.norm(normals[count:].astype(np.float64), axis=1, keepdims=True)
+    unit = np.where(size > 1e-6, normals[count:] / np.maximum(size, 1e-6), [0.0, 1.0, 0.0])
+    normals[count:] = unit
+    return replace(after, normals=normals)
 
 
 def _diagonals(geometry: Geometry) -> NDArray[np.float64]:
@@ -73,9 +96,7 @@ class _Limit:
             self.floor[others] = np.minimum(self.floor[others], self.nearest[k])
         self.floor[self.whole] = np.inf
 
-    def exceeded(
-        self, middle: NDArray[np.float64], length: NDArray[np.float64], owner: NDArray[np.int32]
-    ) -> NDArray[np.bool_]:
+    def exceeded(self, middle: F64, length: F64, owner: NDArray[np.int32], turn: F64) -> NDArray[np.bool_]:
         """Whether edges of this length (M,), middle (M, 3) and object (M,) are longer than h."""
         out: NDArray[np.bool_] = length > self.widest[owner]
         for k, tree in enumerate(self.trees):
@@ -88,14 +109,18 @@ class _Limit:
         return out
 
 
-def _refine(geometry: Geometry, limit: _Limit) -> Geometry:
+def refine(geometry: Geometry, limit: Limit) -> Geometry:
+    """Edges halved until none is beyond the limit; normals of new vertices are linear between the old ones, not unit.
+
+    Where that would take more than MOST_NEW_VERTICES, the limit is widened until it does not.
+    """
     widen = 1.0
     while (out := _cut(geometry, limit, widen)) is None:
         widen *= 1.5
     return out
 
 
-def _cut(geometry: Geometry, limit: _Limit, widen: float) -> Geometry | None:
+def _cut(geometry: Geometry, limit: Limit, widen: float) -> Geometry | None:
     """Halves edges until none is above `widen` times its limit; None where that takes too many vertices."""
     positions, normals, uvs = geometry.positions, geometry.normals, geometry.uvs
     vertex_object = geometry.vertex_object
@@ -116,7 +141,8 @@ def _cut(geometry: Geometry, limit: _Limit, widen: float) -> Geometry | None:
         length = np.linalg.norm(positions[a] - positions[b], axis=1)
         fresh = np.flatnonzero(~np.isin(edges, short, assume_unique=True))
         marked = np.zeros(len(edges), bool)
-        marked[fresh] = limit.exceeded(middle[fresh], length[fresh] / widen, vertex_object[a[fresh]])
+        turn = angle_between(normals[a[fresh]], normals[b[fresh]])
+        marked[fresh] = limit.exceeded(middle[fresh], length[fresh] / widen, vertex_object[a[fresh]], turn / widen)
         if not marked.any():
             break
         short = np.concatenate([short, edges[fresh][~marked[fresh]]])
@@ -133,7 +159,7 @@ def _cut(geometry: Geometry, limit: _Limit, widen: float) -> Geometry | None:
         faces, owner = _split(faces, owner, of_face, longest, number)
         a, b = a[marked], b[marked]
         positions = np.concatenate([positions, middle[marked]])
-        normals = np.concatenate([normals, _between(normals[a], normals[b])])
+        normals = np.concatenate([normals, 0.5 * (normals[a] + normals[b])])
         uvs = np.concatenate([uvs, (0.5 * (uvs[a] + uvs[b])).astype(np.float32)])
         vertex_object = np.concatenate([vertex_object, vertex_object[a]])
     if len(positions) == len(geometry.positions):
@@ -152,11 +178,11 @@ def _cut(geometry: Geometry, limit: _Limit, widen: float) -> Geometry | None:
     )
 
 
-def _between(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Unit normals half way; the first where the two cancel."""
-    normal = a.astype(np.float64) + b
-    size = np.linalg.norm(normal, axis=1, keepdims=True)
-    return np.where(size > 1e-9, normal / np.maximum(size, 1e-9), a).astype(np.float32)
+def angle_between(a: NDArray[np.float32], b: NDArray[np.float32]) -> F64:
+    """Angle (M,), rad, between vectors (M, 3) that are not zero, to the roundings of float32."""
+    x, y = a.astype(np.float64), b.astype(np.float64)
+    sine, cosine = np.linalg.norm(np.cross(x, y), axis=1), np.einsum("mi,mi->m", x, y)
+    return np.arctan2(sine, cosine)
 
 
 def _split(
