@@ -63,6 +63,13 @@ def synthesis(intercept: F32, scale: F32, code: NDArray[np.int8], centre: F32, a
     )
 
 
+def part_of(model: Synthesis, rows: slice) -> Synthesis:
+    """The model of some of its vertices."""
+    return model._replace(
+        intercept=model.intercept[rows], scale=model.scale[rows], code=model.code[rows], axes=model.axes[rows]
+    )
+
+
 class Lighting(NamedTuple):
     """A kernel under a light: band (B,) int64, the bands it has; table (rows, 3, n^2) float32, 2 l + 1 rows a band."""
 
