@@ -70,7 +70,7 @@ def fit_pose(config: Config) -> dict[str, Any]:
     if not poses:
         raise StoreError(
             f'{config.store}: holds no poses to learn from; expected an object with motion = "skinned" and clips, '
-            "and the effect pose."
+            "and the effect pose, which goes with --receivers vertices."
         )
     if config.dry_run:
         return {"dry_run": True, "objects": [_size(store, k, about) for k, about in poses.items()], "notes": []}

@@ -137,6 +137,24 @@ def test_pictures_against_path_tracing(tmp_path, model):
     assert relative_rmse(rgb(ours), rgb(truth)) < 0.1
 
 
+def test_any_lobe_by_the_texels_that_bands_take_for_seen(tmp_path):
+    """A measured material, and lobes from broad to those of a mirror: highlights within 6 to 13 % of path tracing when
+    this was written, its noise taken off as the mean of (x - A)(x - B). Cut to four bands, brass errs by 19 % and a
+    roughness of 0.01 by 120 %."""
+    rough = MATERIALS["cook-torrance"] + "\nadjustable = true"
+    scene = make_scene(tmp_path, ALONE.replace("diffuse = [0.7, 0.3, 0.2]", rough))
+    store = fit(make_store(scene, **SMALL))
+    for setting in ("red=brass", "red.roughness=0.01"):
+        asked = {"poses": (POSE,), "settings": (setting,), "layers": True}
+        ours = read_layers(render(store, "ours.exr", **asked)[0])
+        truth = [
+            read_layers(render(scene, f"truth{k}.exr", **asked, reference=True, spp=64, seed=k)[0]) for k in (0, 1)
+        ]
+        assert flip_hdr(ours[""], truth[0][""]).mean() < 0.06
+        x, a, b = (layers["specular"].astype(float) for layers in (ours, *truth))
+        assert ((x - a) * (x - b)).sum() < 0.15**2 * (a * b).sum()
+
+
 @pytest.mark.parametrize("shape", ["scale = [1.6, 0.7, 1.0]", "scale = [-1, 1, 1]"])
 def test_stretched_and_mirrored_characters(tmp_path, shape):
     """Normals under scales that differ by axis, and faces that turn around; from a clip of one frame beside `bend`."""

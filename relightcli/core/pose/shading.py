@@ -123,25 +123,6 @@ def shade(
     return out
 
 
-def incident(
-    model: Synthesis, scores: NDArray[np.float64], frames: F32, light: NDArray[np.float64], threads: int = 1
-) -> F32:
-    """Light times visibility, (V, 3, n^2) float32, in the world's frame, cut to the n bands of visibility: what any
-    BRDF may be given. light (S, 3)."""
-    out = np.empty((len(frames), 3, model.order**2), np.float32)
-    table = lighting_matrix(np.ones(model.order), light, model.order)  # (n^2, n^2, 3)
-    rows = np.ascontiguousarray(np.moveaxis(table, 2, 0), np.float32)
-    norms = unit_norms(model.order)
-    samples, inverse = _rotation_samples(model.order)
-    score = np.ascontiguousarray(scores, np.float32)
-
-    def part(a: int, b: int) -> None:
-        _incident(model, score, frames, rows, norms, samples, inverse, a, b, out)
-
-    in_parts(part, len(frames), threads)
-    return out
-
-
 def visibility(model: Synthesis, scores: NDArray[np.float64], frames: F32) -> F32:
     """Visibility (V, n^2) float32 of a pose in the world's frame."""
     out = np.empty((len(frames), model.order**2), np.float32)
@@ -249,21 +230,6 @@ def _shade(model, score, frames, axis, kernel, bands, start, table, first, norms
             for j in range(size):
                 total += lit[c * size + j] * v[j]
             out[i, c] = max(total, np.float32(0.0))
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _incident(model, score, frames, rows, norms, samples, inverse, begin, end, out):  # type: ignore[no-untyped-def]
-    size = model.order * model.order
-    number, v = np.empty(model.intercept.shape[1], np.float32), np.empty(size, np.float32)
-    u = np.empty(norms.shape[0] * norms.shape[0], np.float32)
-    for i in range(begin, end):
-        _synthesize(model, score, frames[i], i, norms, samples, inverse, number, u, v)
-        for c in range(3):
-            for k in range(size):
-                total = np.float32(0.0)
-                for j in range(size):
-                    total += rows[c, k, j] * v[j]
-                out[i, c, k] = total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
