@@ -43,6 +43,7 @@ EXCUSED: dict[str, str] = {
     "parts.py": _WHOLE,
     "pose/beside.py": _SUMS,
     "pose/frames.py": _WHOLE,
+    "pose/seen.py": _METHOD,
     "pose/pose_model.py": "lobes, scores and regressions of its neighbours",
     "shade/bounces.py": _SUMS,
     "shade/bright.py": _SUMS,

@@ -174,8 +174,11 @@ def _text(share: Share, allowed: float) -> str:
     return f"at most {share.bound:.2%} of the light ({share.where}); {allowed:.2%} may be left out"
 
 
-def decide_pose(asked: tuple[str, ...] | None, clips: dict[str, int]) -> Decision:
-    """Whether skinned objects are posed. clips: how many each of them has."""
+def decide_pose(asked: tuple[str, ...] | None, clips: dict[str, int], receivers: str) -> Decision:
+    """Whether skinned objects are posed. clips: how many each of them has; receivers: as `--receivers` names them.
+
+    Raises InputError where poses are asked for by name, and receivers are a camera's pixels, which poses would move.
+    """
     moving = [name for name, count in clips.items() if count]
     if not clips:
         return Decision("pose", False, "no object is skinned")
@@ -183,6 +186,13 @@ def decide_pose(asked: tuple[str, ...] | None, clips: dict[str, int]) -> Decisio
         return Decision("pose", False, f"no clip moves {', '.join(clips)}")
     if asked is not None and "pose" not in asked:
         return Decision("pose", False, "not asked for: skinned objects stand in their rest pose")
+    if receivers != "vertices":
+        if asked is not None:
+            raise InputError(
+                f"--receivers {receivers}: what a pixel sees changes with the pose of {', '.join(moving)}; expected "
+                "vertices, or --effects without pose, which keeps the rest pose"
+            )
+        return Decision("pose", False, "pixels see the rest pose; poses need --receivers vertices")
     return Decision("pose", True, f"skinned: {', '.join(moving)}")
 
 

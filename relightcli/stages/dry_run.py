@@ -52,7 +52,7 @@ def dry_run(prepared: Prepared, account: Account) -> dict[str, Any]:
             scene_bytes = _bytes(writer.partial_path)
             spent, started = _pilot(writer, prepared, receivers, starts)
     if "pose" in prepared.simulated:
-        spent["pose"] = _pose_cost(config, prepared.geometry, spent["shadows"])
+        spent["pose"] = _pose_cost(config, prepared.geometry, prepared.both, spent["shadows"])
     if prepared.moving is not None:
         spent["fields"] = np.array(predict(prepared.moving))
         spent["fields"][1] /= max(1, config.workers)
@@ -130,10 +130,15 @@ def _bytes(folder: Path) -> int:
     return sum(f.stat().st_size for f in folder.rglob("c*") if f.is_file() and f.name.split(".")[0] == "c")
 
 
-def _pose_cost(config: Config, geometry: Geometry, traced: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rays, seconds and bytes of the frames of skinned objects, at the speed of the rays of `traced`."""
-    rigs = [rig for rig in geometry.rigs.values() if rig.clips]
-    samples = sum(len(choose_frames(rig, config.pose_frames)) * len(rig.position) for rig in rigs)
+def _pose_cost(
+    config: Config, geometry: Geometry, both: NDArray[np.bool_], traced: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Rays, seconds and bytes of the frames of skinned objects, at the speed of the rays of `traced`. both (O,): whose
+    back is lit too."""
+    rigs = [(rig, both[geometry.object_names.index(name)]) for name, rig in geometry.rigs.items() if rig.clips]
+    samples = sum(
+        len(choose_frames(rig, config.pose_frames)) * len(rig.position) * (2 if backs else 1) for rig, backs in rigs
+    )
     rays = samples * config.pose_directions
     seconds = rays * traced[1] / traced[0] if traced[0] else 0.0
-    return np.array([rays, seconds, 4.0 * samples * config.pose_order**2])
+    return np.array([rays, seconds, 2.0 * samples * config.pose_order**2])  # float16

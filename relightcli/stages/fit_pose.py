@@ -4,10 +4,11 @@ Per skinned object the visibility of its training frames becomes a linear model 
 quantised: intercepts and mean axes float32, slopes int8 with a scale each. The training data stay behind; everything
 else of the transfer store comes along, so that the pose store lights what stands still as the transfer store does.
 
-Arrays, group `pose/K/model`: `intercept` (vertex, number), `slope` (vertex, number, component), `slope_scale`,
-`centre` (vertex, lobe, axis), `pose_mean` (feature,), `pose_direction` (feature, component): with features a,
-numbers = intercept + slope ((a - pose_mean) pose_direction). `pose/K/features` of the training frames stay, to tell how
-far from them a pose is. What the numbers mean is in the root attribute `pose_models`, by K.
+Arrays, group `pose/K/model`: `intercept` (vertex_side, number), `slope` (vertex_side, number, component),
+`slope_scale`, `centre` (vertex_side, lobe, axis), `pose_mean` (feature,), `pose_direction` (feature, component): with
+features a, numbers = intercept + slope ((a - pose_mean) pose_direction). Rows of vertex_side are those of the training
+data (`pose_job`). `pose/K/features` of the training frames stay, to tell how far from them a pose is. What the numbers
+mean is in the root attribute `pose_models`, by K.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ def fit_pose(config: Config) -> dict[str, Any]:
     if not poses:
         raise StoreError(
             f'{config.store}: holds no poses to learn from; expected an object with motion = "skinned" and clips, '
-            "and the effect pose."
+            "and the effect pose, which goes with --receivers vertices."
         )
     if config.dry_run:
         return {"dry_run": True, "objects": [_size(store, k, about) for k, about in poses.items()], "notes": []}
@@ -124,6 +125,7 @@ def _fit(config: Config, store: formats.Store, writer: formats.Writer, k: str, a
     features: NDArray[np.float64] = read(f"pose/{k}/features")
     visibility: NDArray[np.float32] = read(f"pose/{k}/visibility").astype(np.float32)
     clip: NDArray[np.int32] = read(f"pose/{k}/clip")
+    sides = _sides(store, k, about)
     settings = Settings(config.model, config.lobes, config.axes, config.weight, config.ridge, config.components)
     try:
         chosen, model, report, met = _choose(config.tolerance, settings, features, visibility, clip, config.workers)
@@ -135,7 +137,7 @@ def _fit(config: Config, store: formats.Store, writer: formats.Writer, k: str, a
         {
             **meter.read(),
             "frames": len(features),
-            "vertices": visibility.shape[1],
+            "vertices": visibility.shape[1] // sides,
             "model": {
                 "object": about["object"],
                 "model": chosen.kind,
@@ -143,6 +145,7 @@ def _fit(config: Config, store: formats.Store, writer: formats.Writer, k: str, a
                 "axes": chosen.axes,
                 "weight": chosen.weight,
                 "order": model.order,
+                "sides": sides,
                 "ridge": report.ridge,
                 "rank": report.rank,
                 "components": report.components,
@@ -180,23 +183,42 @@ def _choose(
 
 def _put(writer: formats.Writer, group: str, model: PoseModel) -> None:
     codes, scale = formats.quantise(model.slope, "int8", axis=2)
-    writer.put(f"{group}/intercept", model.intercept.astype(np.float32), dims=("vertex", "number"), codec="zstd")
+    writer.put(f"{group}/intercept", model.intercept.astype(np.float32), dims=("vertex_side", "number"), codec="zstd")
     writer.put(
         f"{group}/slope",
         codes,
-        dims=("vertex", "number", "component"),
+        dims=("vertex_side", "number", "component"),
         attrs={"scale": f"{group}/slope_scale"},
         codec="zstd",
     )
-    writer.put(f"{group}/slope_scale", scale, dims=("vertex", "number", "one_component"), codec="zstd")
-    writer.put(f"{group}/centre", model.centre.astype(np.float32), dims=("vertex", "lobe", "axis"), codec="zstd")
+    writer.put(f"{group}/slope_scale", scale, dims=("vertex_side", "number", "one_component"), codec="zstd")
+    writer.put(f"{group}/centre", model.centre.astype(np.float32), dims=("vertex_side", "lobe", "axis"), codec="zstd")
     writer.put(f"{group}/pose_mean", model.mean, dims=("feature",))
     writer.put(f"{group}/pose_direction", model.directions, dims=("feature", "component"))
 
 
 def _size(store: formats.Store, k: str, about: dict[str, Any]) -> dict[str, Any]:
-    frames, vertices, coefficients = store.layouts[f"pose/{k}/visibility"].shape
-    return {"object": about["object"], "frames": frames, "vertices": vertices, "coefficients": coefficients}
+    frames, rows, coefficients = store.layouts[f"pose/{k}/visibility"].shape
+    sides = _sides(store, k, about)
+    return {
+        "object": about["object"],
+        "frames": frames,
+        "vertices": rows // sides,
+        "sides": sides,
+        "coefficients": coefficients,
+    }
+
+
+def _sides(store: formats.Store, k: str, about: dict[str, Any]) -> int:
+    """At how many sides an object's vertices were traced: 1, or 2 where its back is lit too."""
+    sides, rows = about.get("sides"), store.layouts[f"pose/{k}/visibility"].shape[1]
+    vertices = store.layouts[f"pose/{k}/rig/position"].shape[0]
+    if sides not in (1, 2) or rows != sides * vertices:
+        raise StoreError(
+            f"{store.path}: pose/{k}/visibility: expected rows for 1 or 2 sides (poses.{k}.sides) of {vertices} "
+            f"vertices, found {rows} rows and {sides!r} sides. Precompute it again."
+        )
+    return int(sides)
 
 
 def _summary(config: Config, started: float, resumed: bool) -> dict[str, Any]:

@@ -201,7 +201,7 @@ class LightingStore:
         if poses:
             raise InputError(
                 f"--pose: {self.store.path} lights its objects where they stood when it was made; add --reference, or "
-                "pose what fit-pose made of it"
+                + ("pose what fit-pose made of it" if self.camera_name is None else "precompute --receivers vertices")
             )
         return []
 

@@ -2,7 +2,9 @@
 
 In the transfer store, group `pose/K`, K the object's place in the scene: `clip` (frame,) and `seconds` (frame,) of the
 frames, `features` (frame, feature), `joint_matrix` (frame, joint, 4, 4) from bind space to the world, `visibility`
-(frame, vertex, harmonic), and the rig (`rig_store`). What the features are called is in the root attribute `poses`.
+(frame, vertex_side, harmonic), and the rig (`rig_store`). Rows of vertex_side are the vertices as they look along their
+normals; where the object's back is lit too, they are followed by the same from behind. The root attribute `poses` has
+the number of sides, and what the features are called.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ import relight_formats as formats
 from relightcli.adapters.rays import Tracer
 from relightcli.core.pose.frames import Frames, all_frames, every, spread
 from relightcli.core.pose.rig import Rig, blend, feature_names, joint_matrices
-from relightcli.core.pose.visibility import hemisphere_directions, trace_visibility
+from relightcli.core.pose.visibility import both_sides, hemisphere_directions, trace_visibility
 from relightcli.errors import InputError
 from relightcli.run import blocks as run
 from relightcli.scene.model import Geometry, Scene
@@ -44,6 +46,7 @@ class PoseJob:
     directions: int
     others: tuple[int, ...]  # skinned objects that stand elsewhere by then
     surroundings: bool
+    both: bool  # backs are lit too
 
     def open(self) -> PoseWorker:
         return PoseWorker(self)
@@ -69,8 +72,9 @@ class PoseWorker:
         found, rays = [], 0
         info: run.Info = {}
         for matrices in self.matrices[block.start : block.stop]:
-            position, normal, tangent = blend(*self.skin, matrices)  # type: ignore[call-arg]
-            self.positions[self.rows] = position
+            points = blend(*self.skin, matrices)  # type: ignore[call-arg]
+            self.positions[self.rows] = points[0]
+            position, normal, tangent = both_sides(*points) if self.job.both else points
             tracer = Tracer(self.positions, self.faces)
             visibility, more = trace_visibility(tracer, position, normal, tangent, self.directions, self.job.order)
             found.append(visibility)
@@ -119,6 +123,7 @@ def simulate_poses(
     writer: formats.Writer,
     scene: Scene,
     geometry: Geometry,
+    both: NDArray[np.bool_],
     rule: str,
     order: int,
     directions: int,
@@ -127,7 +132,7 @@ def simulate_poses(
     quiet: bool,
     scheduler: str | None = None,
 ) -> None:
-    """Lays down and traces the frames of every skinned object that has clips."""
+    """Lays down and traces the frames of every skinned object that has clips. both (O,): whose back is lit too."""
     about = {}
     for name, rig in geometry.rigs.items():
         if not rig.clips:
@@ -135,21 +140,26 @@ def simulate_poses(
         group = pose_group(geometry.object_names, name)
         frames = choose_frames(rig, rule)
         _put_frames(writer, group, scene, name, rig, frames)
-        about[group.split("/")[1]] = {"object": name, "features": list(feature_names(rig)), "order": order}
-        vertices = len(rig.position)
-        row = 2 * vertices * order * order
+        own = geometry.object_names.index(name)
+        sides = 2 if both[own] else 1
+        features = list(feature_names(rig))
+        about[group.split("/")[1]] = {"object": name, "features": features, "order": order, "sides": sides}
+        rows = sides * len(rig.position)
+        row = 2 * rows * order * order
         size = max(1, min(MOST_FRAMES_PER_BLOCK, CHUNK_BYTES // row))
         writer.array(
             f"{group}/visibility",
-            shape=(len(frames), vertices, order * order),
+            shape=(len(frames), rows, order * order),
             dtype=np.float16,  # rounds by 2e-4 of a number; the rays leave 5e-3 of the norm
-            chunks=(size, vertices, order * order),
-            dims=("frame", "vertex", "harmonic"),
-            attrs={"description": "visibility in the vertex's frame: x tangent, y normal x tangent, z normal"},
+            chunks=(size, rows, order * order),
+            dims=("frame", "vertex_side", "harmonic"),
+            attrs={
+                "description": "visibility in the vertex's frame: x tangent, y normal x tangent, z normal; of backs, "
+                "after all fronts, with the normal turned round"
+            },
         )
-        own = geometry.object_names.index(name)
         others = tuple(geometry.object_names.index(other) for other in geometry.rigs if other != name)
-        job = PoseJob(str(writer.partial_path), group, own, order, directions, others, surroundings)
+        job = PoseJob(str(writer.partial_path), group, own, order, directions, others, surroundings, sides == 2)
         blocks = run.split(group, len(frames), size)
         label = f"poses of {name}"
         run.run_blocks(job, blocks, writer, workers=workers, label=label, quiet=quiet, scheduler=scheduler)

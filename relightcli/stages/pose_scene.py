@@ -115,7 +115,7 @@ class PosedScene:
         cells = max(CELLS, int(store.store.settings.get("bounce_resolution", CELLS)))
         coarse = self._trace(self.everything, self.of_posed, cells, 1)
         horizon = horizon_bits(store.normal[self.of_posed], store.resolution)
-        return coarse, _finer(coarse, store.resolution) & horizon
+        return coarse, finer(coarse, store.resolution) & horizon
 
     def beside(self, name: str, position: NDArray[np.float64], normal: NDArray[np.float32]) -> U8 | None:
         """Cells (N, 6, C, C/8) of points on a posed object that nothing but itself blocks; None where there is nothing
@@ -220,7 +220,7 @@ def _open_unchanged(before, after, changed, out):  # type: ignore[no-untyped-def
                             out[i, f, row, byte] |= np.uint8(1) << np.uint8(k)
 
 
-def _finer(bits: U8, resolution: int) -> U8:
+def finer(bits: U8, resolution: int) -> U8:
     """Bits (N, 6, C, C/8) on a finer cube."""
     times = resolution // bits.shape[2]
     out = []

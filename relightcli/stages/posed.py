@@ -19,29 +19,27 @@ from numpy.typing import NDArray
 
 import relight_formats as formats
 from relightcli.core.brdf.models import PHONG, SHININESS, SPECULAR
-from relightcli.core.brdf.separable import POLAR
 from relightcli.core.lights.environment import SkyCube, splat
 from relightcli.core.pose.beside import (
     band_profile,
-    incident_beside,
     lambert_profile,
     shade_beside,
     sky_cells,
 )
 from relightcli.core.pose.phong_operator import phong_factors
-from relightcli.core.pose.shading import incident, lighting, shade, visibility
+from relightcli.core.pose.seen import seen_bits
+from relightcli.core.pose.shading import lighting, shade, visibility
 from relightcli.core.shade.gather import Gather
+from relightcli.core.shade.glossy import SkyTree, sky_tree, specular_radiance
 from relightcli.core.shade.irradiance import irradiance, moment_prefix
-from relightcli.core.shade.low_order import response, shade_low_order
 from relightcli.core.sphere import sh
 from relightcli.core.transport.local_lights import LocalLights
-from relightcli.core.transport.transfer import local_rotations
 from relightcli.errors import InputError, StoreError
 from relightcli.scene.model import Geometry
 from relightcli.scene.posing import resolve_poses
 from relightcli.stages.lighting import IN_MEMORY, LightingStore, _Coats
-from relightcli.stages.pose_scene import PosedScene
-from relightcli.stages.posed_object import PosedObject, PosedState
+from relightcli.stages.pose_scene import SLAB, PosedScene, finer
+from relightcli.stages.posed_object import PosedObject, PosedState, Side
 from relightcli.stages.rig_store import read_rigs
 
 F32 = NDArray[np.float32]
@@ -67,8 +65,7 @@ class PoseStore(LightingStore):
     def set_poses(self, poses: tuple[str, ...]) -> list[str]:
         """Poses objects, as `--pose` takes them, those not named as they rest; what there is to say about it.
 
-        Raises InputError for unknown objects and clips, for objects that the store has no model of, and where a fixed
-        camera's pixels would have to follow.
+        Raises InputError for unknown objects and clips, and for objects that the store has no model of.
         """
         return self._pose(poses, *self._rest)
 
@@ -81,21 +78,15 @@ class PoseStore(LightingStore):
         self.geometry, self.position, self.normal = geometry, position, normal
         if not resolved:
             return notes
-        if self.camera_name is not None:
-            raise InputError(
-                f"--pose: the receivers of {self.store.path} are the pixels of camera {self.camera_name!r}; "
-                "precompute with --receivers vertices"
-            )
         positions, normals = geometry.positions.copy(), geometry.normals.copy()
         self.position, self.normal = position.copy(), normal.copy()
         for name, (clip, seconds) in resolved.items():
             item = self._object(name)
             state = self._posed[name] = item.at(clip, seconds)
             positions[item.vertices], normals[item.vertices] = state.position, state.normal
-            self.position[item.front_receiver] = state.position[item.front]
-            self.position[item.back_receiver] = state.position[item.back]
-            self.normal[item.front_receiver] = state.normal[item.front]
-            self.normal[item.back_receiver] = -state.normal[item.back]
+            for side in item.sides:
+                self.position[side.receivers] = state.position[side.vertices]
+                self.normal[side.receivers] = state.facing(side)[0][side.vertices]
             if state.distance > item.gap:
                 notes.append(
                     f"{name} at {clip.name}@{seconds:g}: the pose is {state.distance:.2f} from the nearest training "
@@ -126,8 +117,7 @@ class PoseStore(LightingStore):
         """See `LightingStore.buried`. Of posed objects nothing is known to be."""
         buried = super().buried().copy()
         for name in self._posed:
-            item = self._objects[name]
-            buried[item.front_receiver] = buried[item.back_receiver] = False
+            buried[self._objects[name].receivers] = False
         return buried
 
     # -- who sees what
@@ -174,16 +164,14 @@ class PoseStore(LightingStore):
             self._light_bits = self._scene.light_bits(*found, list(self.scene.lights.values()))
         return self._light_bits, found[1]
 
-    def _open_cells(self, item: PosedObject, state: PosedState, back: bool = False) -> U8 | None:
-        """Cells that others leave open to the vertices of a posed object, or to its back's receivers."""
-        key = item.name, back
+    def _open_cells(self, item: PosedObject, state: PosedState, side: Side) -> U8 | None:
+        """Cells that others leave open to one side of the vertices of a posed object."""
+        key = item.name, side.back
         if key not in self._beside:
             found = None
             if self._scene is not None:
-                rows = item.back if back else np.arange(len(state.position))
-                sign = -1.0 if back else 1.0
-                normal = (sign * state.normal[rows]).astype(np.float32)
-                found = self._scene.beside(item.name, state.position[rows], normal)
+                normal = state.facing(side)[0].astype(np.float32)
+                found = self._scene.beside(item.name, state.position, normal)
             self._beside[key] = found
         return self._beside[key]
 
@@ -194,7 +182,7 @@ class PoseStore(LightingStore):
             return super()._irradiance(sky, active, basis)
         still = np.ones(len(self), bool) if active is None else active.copy()
         for name in self._posed:
-            still[self._objects[name].front_receiver] = still[self._objects[name].back_receiver] = False
+            still[self._objects[name].receivers] = False
         out = np.zeros((len(self), 3), np.float32)
         if still.any():
             out[:] = super()._irradiance(sky, still, basis)
@@ -202,9 +190,8 @@ class PoseStore(LightingStore):
                 self._take_off(sky, out)
         for name, state in self._posed.items():
             item = self._objects[name]
-            out[item.front_receiver] = self._diffuse(item, state, sky)[item.front]
-            if len(item.back):
-                out[item.back_receiver] = self._behind(item, state, sky)
+            for side in item.sides:
+                out[side.receivers] = self._diffuse(item, state, side, sky)[side.vertices]
         return out
 
     def _take_off(self, sky: SkyCube, out: F32) -> None:
@@ -215,35 +202,24 @@ class PoseStore(LightingStore):
         was, left = (irradiance(bits, self.normal[rows], prefix, self.threads) for bits in (before, now))
         out[rows] *= np.clip(left / np.maximum(was, np.float32(1e-30)), 0.0, 1.0)
 
-    def _diffuse(self, item: PosedObject, state: PosedState, sky: SkyCube) -> F32:
-        """Irradiance (V, 3) of a posed object's vertices."""
-        order = item.model.order
+    def _diffuse(self, item: PosedObject, state: PosedState, side: Side, sky: SkyCube) -> F32:
+        """Irradiance (V, 3) of one side of a posed object's vertices."""
+        order, model = item.order, side.model
         cosine = item.weight == "cosine"
-        normals = np.ascontiguousarray(state.frames[:, 2])
+        frames = state.facing(side)[1]
+        normals = np.ascontiguousarray(frames[:, 2])
         first = np.zeros(len(normals), np.int32)
         # A cosine-weighted model is lit by the light itself: kappa_0 = 4 makes l . v / pi of it.
         kappa = np.array([4.0]) if cosine else phong_factors(DIFFUSE, 2 * order - 1)
-        cells = self._open_cells(item, state)
+        cells = self._open_cells(item, state, side)
         if cells is None:
             light = _light(sky, len(kappa), order)
             lights = [lighting(kappa, light, order)]
-            e = shade(item.model, state.scores, state.frames, normals, first, lights, self.threads)
+            e = shade(model, state.scores, frames, normals, first, lights, self.threads)
         else:
-            seen = visibility(item.model, state.scores, state.frames)
+            seen = visibility(model, state.scores, frames)
             profile = band_profile(kappa) if cosine else lambert_profile()
             e = shade_beside(seen, cells, sky_cells(sky, order), normals, first, [profile], self.threads)
-        return np.float32(math.pi) * e
-
-    def _behind(self, item: PosedObject, state: PosedState, sky: SkyCube) -> F32:
-        """Irradiance of the backs: nothing is known of what the body hides from them. [digest of Eq. 22]"""
-        normals = -state.normal[item.back]
-        cells = self._open_cells(item, state, back=True)
-        if cells is None:
-            return _open(sky, normals)
-        whole = np.full((len(normals), 1), math.sqrt(4.0 * math.pi), np.float32)
-        first = np.zeros(len(normals), np.int32)
-        axis = np.ascontiguousarray(normals, np.float32)
-        e = shade_beside(whole, cells, sky_cells(sky, 1), axis, first, [lambert_profile()], self.threads)
         return np.float32(math.pi) * e
 
     def _exact_specular(
@@ -261,101 +237,86 @@ class PoseStore(LightingStore):
         asked[rows] = True
         still = asked.copy()
         for name in self._posed:
-            still[self._objects[name].front_receiver] = still[self._objects[name].back_receiver] = False
+            still[self._objects[name].receivers] = False
         out = np.zeros((len(self), 3), np.float32)
         if still.any():
             out = super()._exact_specular(sky, environment, rotate, coats, view, np.flatnonzero(still))
+        tree: SkyTree | None = None
         for name, state in self._posed.items():
             item = self._objects[name]
-            wanted = asked[item.front_receiver]
-            if wanted.any():
-                self._specular_of(item, state, sky, coats, view, item.front[wanted], item.front_receiver[wanted], out)
+            for side in item.sides:
+                wanted = asked[side.receivers]
+                phong = coats.table.model[coats.material[side.receivers]] == PHONG
+                own = _part(side, wanted & phong)
+                if len(own.vertices):
+                    out[own.receivers] = self._phong(item, state, own, sky, coats, view)
+                own = _part(side, wanted & ~phong)
+                if len(own.vertices):
+                    tree = tree or sky_tree(splat(sky), environment, rotate)
+                    out[own.receivers] = self._lobes(item, state, own, tree, coats, view)
         return out
 
-    def _specular_of(
-        self,
-        item: PosedObject,
-        state: PosedState,
-        sky: SkyCube,
-        coats: _Coats,
-        view: F32,
-        vertices: NDArray[np.int64],
-        receivers: NDArray[np.int32],
-        out: F32,
-    ) -> None:
-        """Specular light of a posed object's vertices into the receivers' rows of out: phong by its kernel, other
-        models by their response to the light that arrives, cut to the bands of visibility."""
-        if item.weight == "cosine":
-            raise InputError(
-                f"{item.name}: its model of cosine-weighted visibility lights lambert materials only; fit with "
-                "--weight none"
-            )
-        order = item.model.order
-        material = np.full(len(state.frames), -1, np.int32)
-        material[vertices] = coats.material[receivers]
-        towards = np.zeros((len(state.frames), 3))
-        towards[vertices] = view[receivers]
-        normal = state.normal
+    def _phong(self, item: PosedObject, state: PosedState, side: Side, sky: SkyCube, coats: _Coats, view: F32) -> F32:
+        """Light of phong lobes at the vertices of a side, (N, 3): by the lobe's own kernel, in the bands."""
+        _need_plain(item)
+        order, (normal, frames) = item.order, state.facing(side)
+        material = np.full(len(frames), -1, np.int32)
+        material[side.vertices] = coats.material[side.receivers]
+        towards = np.zeros((len(frames), 3))
+        towards[side.vertices] = view[side.receivers]
         cosine = (normal * towards).sum(1)
         material[cosine <= 0.0] = -1
-        mirrored = 2.0 * cosine[:, None] * normal - towards
-        colours = coats.table.parameters[:, SPECULAR : SPECULAR + 3].astype(np.float32)
-        bands = 2 * order - 1
-        found = np.zeros((len(material), 3), np.float32)
+        mirrored = np.ascontiguousarray(2.0 * cosine[:, None] * normal - towards, np.float32)
         used = np.unique(material[material >= 0])
-        phong = [m for m in used if coats.table.model[m] == PHONG]
-        open_cells = self._open_cells(item, state)
-        seen = None if open_cells is None else visibility(item.model, state.scores, state.frames)
-        if phong:
-            place = np.full(len(coats.table.model) + 1, -1, np.int32)
-            place[phong] = np.arange(len(phong))
-            factors = [phong_factors(float(coats.table.parameters[m, SHININESS]), bands) for m in phong]
-            axis = np.ascontiguousarray(mirrored, np.float32)
-            kernel = place[material]
-            if seen is None or open_cells is None:
-                lights = [lighting(kappa, _light(sky, bands, order), order) for kappa in factors]
-                found = shade(item.model, state.scores, state.frames, axis, kernel, lights, self.threads)
-            else:
-                profiles = [band_profile(kappa) for kappa in factors]
-                cells = sky_cells(sky, order)
-                found = shade_beside(seen, open_cells, cells, axis, kernel, profiles, self.threads)
-        others = [m for m in used if coats.table.model[m] != PHONG]
-        if others:
-            rows = np.flatnonzero(np.isin(material, others))
-            if seen is None or open_cells is None:
-                arriving = incident(item.model, state.scores, state.frames, _light(sky, order, order), self.threads)
-            else:
-                arriving = incident_beside(seen, open_cells, sky_cells(sky, order), self.threads)
-            turned = local_rotations(normal[rows].astype(np.float32), order)
-            local = np.ascontiguousarray(np.einsum("nst,nct->ncs", turned, arriving[rows]))
-            table = np.zeros((len(coats.table.model), POLAR, order * (order + 1) // 2), np.float32)
-            for m in others:
-                table[m] = response(int(coats.table.model[m]), coats.table.parameters[m], order)
-            both = shade_low_order(
-                np.arange(len(rows)),
-                local,
-                np.zeros((len(rows), 3), np.float32),
-                normal[rows].astype(np.float32),
-                towards[rows].astype(np.float32),
-                table,
-                np.ones((len(colours), 3), np.float32),
-                material[rows],
-                self.threads,
-            )
-            found[rows] = np.maximum(both[0], 0.0)
-        found *= np.where(material[:, None] >= 0, colours[material], np.float32(0.0))
-        out[receivers] = found[vertices]
+        place = np.full(len(coats.table.model) + 1, -1, np.int32)
+        place[used] = np.arange(len(used))
+        bands = 2 * order - 1
+        factors = [phong_factors(float(coats.table.parameters[m, SHININESS]), bands) for m in used]
+        if not factors:
+            return np.zeros((len(side.vertices), 3), np.float32)
+        kernel = place[material]
+        open_cells = self._open_cells(item, state, side)
+        if open_cells is None:
+            lights = [lighting(kappa, _light(sky, bands, order), order) for kappa in factors]
+            found = shade(side.model, state.scores, frames, mirrored, kernel, lights, self.threads)
+        else:
+            seen = visibility(side.model, state.scores, frames)
+            profiles = [band_profile(kappa) for kappa in factors]
+            found = shade_beside(seen, open_cells, sky_cells(sky, order), mirrored, kernel, profiles, self.threads)
+        colours = coats.table.parameters[:, SPECULAR : SPECULAR + 3].astype(np.float32)
+        return found[side.vertices] * colours[coats.material[side.receivers]]
+
+    def _lobes(self, item: PosedObject, state: PosedState, side: Side, tree: SkyTree, coats: _Coats, view: F32) -> F32:
+        """Light of any lobes at the vertices of a side, (N, 3): over the texels that the bands take for seen."""
+        _need_plain(item)
+        normals, frames = state.facing(side)
+        visible, open_cells = visibility(side.model, state.scores, frames), self._open_cells(item, state, side)
+        out = np.zeros((len(side.vertices), 3), np.float32)
+        for start in range(0, len(out), SLAB):
+            part = slice(start, start + SLAB)
+            own, rows = side.vertices[part], side.receivers[part]
+            normal = normals[own].astype(np.float32)
+            bits = seen_bits(visible[own], normal, tree.resolution, self.threads)
+            if open_cells is not None:
+                bits &= finer(open_cells[own], tree.resolution)
+            every, material = np.arange(len(own)), coats.material[rows]
+            out[part] = specular_radiance(bits, every, normal, view[rows], material, coats.table, tree, self.threads)
+        return out
+
+
+def _part(side: Side, lit: NDArray[np.bool_]) -> Side:
+    """A side with those of its lit vertices (N,) alone."""
+    return replace(side, vertices=side.vertices[lit], receivers=side.receivers[lit])
+
+
+def _need_plain(item: PosedObject) -> None:
+    if item.weight == "cosine":
+        raise InputError(
+            f"{item.name}: its model of cosine-weighted visibility lights lambert materials only; fit with --weight "
+            "none"
+        )
 
 
 def _light(sky: SkyCube, bands: int, order: int) -> NDArray[np.float64]:
     """The sky's coefficients, all that a kernel of so many bands and visibility of order n can tell apart."""
     return sh.project_sky(sky.flux, sky.resolution, bands + order - 1)
-
-
-def _open(sky: SkyCube, normals: NDArray[np.float64]) -> F32:
-    """Irradiance (N, 3) of surfaces that nothing shadows. [KT2: sum of A_l L_lm y_lm(n)]"""
-    order = 9
-    factors = math.pi * np.repeat(phong_factors(DIFFUSE, order), 2 * np.arange(order) + 1)
-    light = sh.project_sky(sky.flux, sky.resolution, order) * factors[:, None]
-    out: F32 = np.maximum(sh.harmonics(normals, order) @ light, 0.0).astype(np.float32)
-    return out

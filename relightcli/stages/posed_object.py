@@ -11,14 +11,27 @@ from numpy.typing import NDArray
 from relightcli.core.pose.clip import Clip
 from relightcli.core.pose.linear_model import distance
 from relightcli.core.pose.rig import Rig, pose_features, posed
-from relightcli.core.pose.shading import Synthesis, synthesis
+from relightcli.core.pose.shading import Synthesis, part_of, synthesis
+from relightcli.errors import StoreError
 from relightcli.stages.lighting import LightingStore
 
 F32 = NDArray[np.float32]
+TURNED = np.array([[1.0], [-1.0], [-1.0]], np.float32)  # a front's frame to its back's: half a turn about the tangent
+
+
+@dataclass(frozen=True)
+class Side:
+    """The fronts, or the backs, of an object's vertices: the model of what all of them see; `vertices` (N,) of the rig
+    that are lit there, and their receivers (N,)."""
+
+    back: bool
+    model: Synthesis
+    vertices: NDArray[np.int64]
+    receivers: NDArray[np.int32]
 
 
 class PosedObject:
-    """One skinned object: its model, which receivers are its vertices', and the pose it is in."""
+    """One skinned object: its sides, which receivers are its vertices', and what its poses are told from."""
 
     def __init__(self, store: LightingStore, number: str, about: dict[str, Any], rig: Rig) -> None:
         read: Any = store.store.read
@@ -28,7 +41,7 @@ class PosedObject:
         self.features: NDArray[np.float64] = read(f"{group}/features")
         self.mean: NDArray[np.float64] = read(f"{group}/model/pose_mean")
         self.directions: NDArray[np.float64] = read(f"{group}/model/pose_direction")
-        self.model: Synthesis = synthesis(
+        model = synthesis(
             read(f"{group}/model/intercept"),
             read(f"{group}/model/slope_scale")[:, :, 0],
             read(f"{group}/model/slope"),
@@ -37,12 +50,20 @@ class PosedObject:
             int(about["order"]),
         )
         self.vertices = np.flatnonzero(store.geometry.vertex_object == int(number))
-        front, back = store.receiver_of_vertex()
-        front, back = front[self.vertices], back[self.vertices]
-        self.front = np.flatnonzero(front >= 0)  # vertices of the rig, and their receivers
-        self.front_receiver = front[self.front]
-        self.back = np.flatnonzero(back >= 0)
-        self.back_receiver = back[self.back]
+        count, places = len(rig.position), [r[self.vertices] for r in store.receiver_of_vertex()]
+        sides = 2 if (places[1] >= 0).any() else 1
+        if about["sides"] != sides or any(len(array) != sides * count for array in model[:4]):
+            raise StoreError(
+                f"{store.store.path}: {group}/model: expected {sides} x {count} rows, for every lit side of every "
+                f"vertex of {self.name!r}, found {len(model.intercept)}. Precompute and fit it again."
+            )
+        self.order = model.order
+        self.sides: list[Side] = []
+        for side, receivers in enumerate(places[:sides]):
+            rows = slice(side * count, (side + 1) * count)
+            lit = np.flatnonzero(receivers >= 0)
+            self.sides.append(Side(bool(side), part_of(model, rows), lit, receivers[lit]))
+        self.receivers = np.concatenate([side.receivers for side in self.sides])
 
     def at(self, clip: Clip, seconds: float) -> PosedState:
         """Where the object is at that moment of a clip."""
@@ -63,3 +84,7 @@ class PosedState:
     frames: F32
     scores: NDArray[np.float64]
     distance: float
+
+    def facing(self, side: Side) -> tuple[NDArray[np.float64], F32]:
+        """Normals (V, 3) and frames (V, 3, 3) of one side of the skin."""
+        return (-self.normal, self.frames * TURNED) if side.back else (self.normal, self.frames)

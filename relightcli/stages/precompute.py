@@ -87,6 +87,7 @@ def precompute(config: Config) -> dict[str, Any]:
                     writer,
                     scene,
                     geometry,
+                    prepared.both,
                     config.pose_frames,
                     config.pose_order,
                     config.pose_directions,

@@ -132,7 +132,7 @@ def prepare(config: Config, account: Account) -> Prepared:
     if wanted:
         check_bounces(config)
     fields = effects.decide_fields(asked, motions, len(scene.lights))
-    pose = effects.decide_pose(asked, {name: len(rig.clips) for name, rig in source.rigs.items()})
+    pose = effects.decide_pose(asked, {name: len(rig.clips) for name, rig in source.rigs.items()}, config.receivers)
     with account.step("planning"):
         plan, bounces = effects.decide(
             asked,

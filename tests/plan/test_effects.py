@@ -58,9 +58,19 @@ def test_names_that_are_refused(text, message):
     ],
 )
 def test_poses_of_what_has_clips(asked, clips, simulate, evidence):
-    decision = decide_pose(asked, clips)
+    decision = decide_pose(asked, clips, "vertices")
     assert decision.simulate == simulate
     assert decision.evidence.startswith(evidence)
+
+
+def test_pixels_have_no_poses():
+    decision = decide_pose(None, {"man": 1, "box": 0}, "pixels:main")
+    assert not decision.simulate
+    assert decision.evidence == "pixels see the rest pose; poses need --receivers vertices"
+    for asked in (AVAILABLE, ("direct", "pose")):
+        assert not decide_pose(asked, {"box": 0}, "pixels:main").simulate
+        with pytest.raises(InputError, match=r"--receivers pixels:main: .*pose of man; expected vertices"):
+            decide_pose(asked, {"man": 1}, "pixels:main")
 
 
 @pytest.mark.parametrize(

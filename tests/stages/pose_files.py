@@ -1,4 +1,4 @@
-"""A scene with a skinned character that is cheap to trace: a jointed bar over a floor."""
+"""Scenes with a skinned character that is cheap to trace: a jointed bar over a floor, and a sheet."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ eye = [0.5, 1.5, 5]
 target = [0, 1, 0]
 size = [20, 16]
 """
-SIDES = 4
+SIDES = 4  # of the bar
+COLUMNS, ROWS = 7, 13  # of the sheet's vertices
 
 
 def bar(path):
@@ -48,6 +49,29 @@ def bar(path):
         for k in range(len(heights) - 1):
             at = first + 2 * k
             faces += [(at, at + 2, at + 1), (at + 1, at + 2, at + 3)]
+    return _jointed(path, points, normals, weights, faces, 2, [0, 30, 60, 90, 120])
+
+
+def sheet(path, degrees=tuple(range(-120, 121, 30))):
+    """A sheet of no thickness, 1 wide and from y = 0 to 2, that looks along z, with a joint in its middle; the clip
+    `bend` (0 to 4 s) folds it back by 120 degrees at first, and forth by as much in the end."""
+    points, normals, weights, faces = [], [], [], []
+    for y in np.linspace(0, 2, ROWS):
+        up = np.clip((y - 0.5) / 1.0, 0, 1)
+        for x in np.linspace(-0.5, 0.5, COLUMNS):
+            points.append((x, y, 0))
+            normals.append((0, 0, 1))
+            weights.append((1 - up, up, 0, 0))
+    for row in range(ROWS - 1):
+        for column in range(COLUMNS - 1):
+            at = row * COLUMNS + column
+            faces += [(at, at + 1, at + COLUMNS), (at + 1, at + COLUMNS + 1, at + COLUMNS)]
+    return _jointed(path, points, normals, weights, faces, 0, degrees)
+
+
+def _jointed(path, points, normals, weights, faces, axis, degrees):
+    """A mesh whose upper joint, at y = 1, turns about an axis: by the next of some degrees every half second (`bend`),
+    by the third of them (`still`)."""
     b = Builder()
     inverse = np.tile(np.eye(4, dtype="<f4").reshape(1, 16), (2, 1))
     inverse[1, 13] = -1
@@ -66,8 +90,10 @@ def bar(path):
     b.node(name="low", children=[2])
     b.node(name="high", translation=[0, 1, 0])
     b.header["skins"] = [{"joints": [1, 2], "inverseBindMatrices": b.accessor(inverse, type="MAT4")}]
-    turns = [(0, 0, np.sin(a / 2), np.cos(a / 2)) for a in np.radians([0, 30, 60, 90, 120])]
-    animate(b, "rotation", np.linspace(0, 2, 5), turns, name="bend")
+    half = 0.5 * np.radians(degrees)
+    turns = np.zeros((len(half), 4))
+    turns[:, axis], turns[:, 3] = np.sin(half), np.cos(half)
+    animate(b, "rotation", 0.5 * np.arange(len(turns)), turns, name="bend")
     animate(b, "rotation", [0], turns[2:3], name="still")
     return b.glb(path)
 

@@ -128,8 +128,6 @@ def test_pictures_against_path_tracing(tmp_path, model):
     relative RMS is that of the bar: a lobe of four bands errs by 7 % of a hemisphere's energy, and most where it is
     sharp."""
     text = ALONE.replace("diffuse = [0.7, 0.3, 0.2]", MATERIALS[model])
-    if model == "translucent":  # a closed body blocks its own inside, which the model takes as open: compare fronts
-        text = text.replace("transmittance = [0.3, 0.2, 0.1]", "transmittance = [0.0, 0.0, 0.0]")
     scene = make_scene(tmp_path, text)
     store = fit(make_store(scene, **SMALL))
     ours, result = render(store, "ours.exr", poses=(POSE,))
@@ -139,16 +137,22 @@ def test_pictures_against_path_tracing(tmp_path, model):
     assert relative_rmse(rgb(ours), rgb(truth)) < 0.1
 
 
-def test_a_membrane_lets_the_sky_behind_it_through(tmp_path):
-    """Diffuse 0, even sky 1, nothing blocked behind: exit radiance is the transmittance, whatever the pose."""
-    text = ALONE.replace("diffuse = [0.7, 0.3, 0.2]", MATERIALS["translucent"].replace("[0.4, 0.3, 0.2]", "[0, 0, 0]"))
-    scene = make_scene(tmp_path, text)
-    write_image(tmp_path / "sky.exr", np.ones((4, 8, 3), np.float32))
+def test_any_lobe_by_the_texels_that_bands_take_for_seen(tmp_path):
+    """A measured material, and lobes from broad to those of a mirror: highlights within 6 to 13 % of path tracing when
+    this was written, its noise taken off as the mean of (x - A)(x - B). Cut to four bands, brass errs by 19 % and a
+    roughness of 0.01 by 120 %."""
+    rough = MATERIALS["cook-torrance"] + "\nadjustable = true"
+    scene = make_scene(tmp_path, ALONE.replace("diffuse = [0.7, 0.3, 0.2]", rough))
     store = fit(make_store(scene, **SMALL))
-    output, _ = render(store, "membrane.zarr", poses=(POSE,))
-    radiance = formats.open_store(output).read("radiance")[0]
-    side = formats.open_store(store).read("receivers/side")
-    np.testing.assert_allclose(radiance[side > 0], np.tile([0.3, 0.2, 0.1], ((side > 0).sum(), 1)), rtol=2e-3)
+    for setting in ("red=brass", "red.roughness=0.01"):
+        asked = {"poses": (POSE,), "settings": (setting,), "layers": True}
+        ours = read_layers(render(store, "ours.exr", **asked)[0])
+        truth = [
+            read_layers(render(scene, f"truth{k}.exr", **asked, reference=True, spp=64, seed=k)[0]) for k in (0, 1)
+        ]
+        assert flip_hdr(ours[""], truth[0][""]).mean() < 0.06
+        x, a, b = (layers["specular"].astype(float) for layers in (ours, *truth))
+        assert ((x - a) * (x - b)).sum() < 0.15**2 * (a * b).sum()
 
 
 @pytest.mark.parametrize("shape", ["scale = [1.6, 0.7, 1.0]", "scale = [-1, 1, 1]"])

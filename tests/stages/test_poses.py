@@ -10,11 +10,13 @@ from relightcli.adapters.rays import Tracer
 from relightcli.core.pose.rig import posed
 from relightcli.core.sphere.sh import harmonics
 from relightcli.core.transport.tessellation import tessellate
-from relightcli.errors import InputError
+from relightcli.errors import InputError, StoreError
 from relightcli.run import blocks as run
 from relightcli.scene.build import build_geometry
 from relightcli.scene.parse import load_scene
 from relightcli.scene.posing import apply_poses
+from relightcli.stages.fit_pose import Config as FitConfig
+from relightcli.stages.fit_pose import fit_pose
 from relightcli.stages.inspect import inspect
 from relightcli.stages.lighting import read_scene
 from relightcli.stages.pose_job import PoseWorker
@@ -234,12 +236,29 @@ def test_a_character_without_clips_stands_still(tmp_path):
     assert plan["pose"] == "no clip moves bar"
 
 
-def test_bounces_and_pixels_beside_poses(scene):
-    for number, settings in enumerate(({"bounces": 1}, {"receivers": "pixels:main"})):
-        opened = formats.open_store(make_store(scene, f"more{number}.zarr", **{**SMALL, **settings}))
-        assert opened.read("pose/0/visibility").shape[0] == 6
-        rgb, _ = picture(opened.path, f"more{number}.exr", env="sky")
-        assert np.isfinite(rgb).all()
+def test_bounces_beside_poses(scene):
+    opened = formats.open_store(make_store(scene, "more.zarr", **{**SMALL, "bounces": 1}))
+    assert opened.read("pose/0/visibility").shape[0] == 6
+    rgb, _ = picture(opened.path, "more.exr", env="sky")
+    assert np.isfinite(rgb).all()
+
+
+def test_pixels_see_the_rest_pose_and_its_shadows(scene, tmp_path):
+    """And nothing is traced for poses that they could not show. 64 samples a pixel of a reference leave 3 % noise."""
+    store = make_store(scene, "pixels.zarr", **SMALL, receivers="pixels:main")
+    opened = formats.open_store(store)
+    assert "poses" not in opened.attrs
+    plan = {row["effect"]: row["evidence"] for row in opened.attrs["plan"]}
+    assert plan["pose"] == "pixels see the rest pose; poses need --receivers vertices"
+    rgb, _ = picture(store, "pixels.exr", env="sky")
+    truth = picture_of(render(scene, tmp_path / "truth.exr", spp=64))
+    assert np.linalg.norm(rgb - truth) < 0.06 * np.linalg.norm(truth)
+    with pytest.raises(InputError, match=r"--pose: .*pixels.zarr .*precompute --receivers vertices"):
+        relight(RelightConfig(store=store, output=str(tmp_path / "a.exr"), quiet=True, poses=("bar=bend@1",)))
+    with pytest.raises(StoreError, match=r"no poses to learn from.*--receivers vertices"):
+        fit_pose(FitConfig(store=store, output=tmp_path / "pose.zarr", quiet=True))
+    with pytest.raises(InputError, match=r"--receivers pixels:main: .*pose of bar; expected vertices"):
+        make_store(scene, "never.zarr", **SMALL, receivers="pixels:main", effects="direct,shadows,pose")
 
 
 def test_the_error_of_the_rays_is_measured(scene, store):

@@ -87,18 +87,6 @@ def shade_beside(
     return out
 
 
-def incident_beside(visibility: F32, bits: NDArray[np.uint8], cells: SkyCells, threads: int = 1) -> F32:
-    """Light that arrives, (V, 3, n^2) float32, in the world's frame, cut to n bands; see `shade_beside`."""
-    out = np.zeros((len(visibility), 3, visibility.shape[1]), np.float32)
-    words = np.ascontiguousarray(bits).reshape(len(bits), -1)
-
-    def part(a: int, b: int) -> None:
-        _incident(visibility, words, cells, a, b, out)
-
-    in_parts(part, len(visibility), threads)
-    return out
-
-
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 def _seen(visibility, harmonics, v, c):  # type: ignore[no-untyped-def]
     total = np.float32(0.0)
@@ -132,16 +120,3 @@ def _shade(visibility, words, cells, axis, kernel, tables, first, last, out):  #
             g += w * cells.flux[c, 1]
             b += w * cells.flux[c, 2]
         out[v, 0], out[v, 1], out[v, 2] = max(r, np.float32(0.0)), max(g, np.float32(0.0)), max(b, np.float32(0.0))
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _incident(visibility, words, cells, first, last, out):  # type: ignore[no-untyped-def]
-    for v in range(first, last):
-        for c in range(len(cells.flux)):
-            if not (words[v, c >> 3] >> np.uint8(c & 7)) & np.uint8(1):
-                continue
-            seen = _seen(visibility, cells.harmonics, v, c)
-            for colour in range(3):
-                w = seen * cells.flux[c, colour]
-                for i in range(visibility.shape[1]):
-                    out[v, colour, i] += w * cells.harmonics[c, i]

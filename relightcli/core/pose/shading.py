@@ -63,6 +63,13 @@ def synthesis(intercept: F32, scale: F32, code: NDArray[np.int8], centre: F32, a
     )
 
 
+def part_of(model: Synthesis, rows: slice) -> Synthesis:
+    """The model of some of its vertices."""
+    return model._replace(
+        intercept=model.intercept[rows], scale=model.scale[rows], code=model.code[rows], axes=model.axes[rows]
+    )
+
+
 class Lighting(NamedTuple):
     """A kernel under a light: band (B,) int64, the bands it has; table (rows, 3, n^2) float32, 2 l + 1 rows a band."""
 
@@ -111,25 +118,6 @@ def shade(
         _shade(
             model, score, frames, axis, kernel, bands, start, table, first, norms, samples, inverse, a, b, out
         )  # fmt: skip
-
-    in_parts(part, len(frames), threads)
-    return out
-
-
-def incident(
-    model: Synthesis, scores: NDArray[np.float64], frames: F32, light: NDArray[np.float64], threads: int = 1
-) -> F32:
-    """Light times visibility, (V, 3, n^2) float32, in the world's frame, cut to the n bands of visibility: what any
-    BRDF may be given. light (S, 3)."""
-    out = np.empty((len(frames), 3, model.order**2), np.float32)
-    table = lighting_matrix(np.ones(model.order), light, model.order)  # (n^2, n^2, 3)
-    rows = np.ascontiguousarray(np.moveaxis(table, 2, 0), np.float32)
-    norms = unit_norms(model.order)
-    samples, inverse = _rotation_samples(model.order)
-    score = np.ascontiguousarray(scores, np.float32)
-
-    def part(a: int, b: int) -> None:
-        _incident(model, score, frames, rows, norms, samples, inverse, a, b, out)
 
     in_parts(part, len(frames), threads)
     return out
@@ -242,21 +230,6 @@ def _shade(model, score, frames, axis, kernel, bands, start, table, first, norms
             for j in range(size):
                 total += lit[c * size + j] * v[j]
             out[i, c] = max(total, np.float32(0.0))
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _incident(model, score, frames, rows, norms, samples, inverse, begin, end, out):  # type: ignore[no-untyped-def]
-    size = model.order * model.order
-    number, v = np.empty(model.intercept.shape[1], np.float32), np.empty(size, np.float32)
-    u = np.empty(norms.shape[0] * norms.shape[0], np.float32)
-    for i in range(begin, end):
-        _synthesize(model, score, frames[i], i, norms, samples, inverse, number, u, v)
-        for c in range(3):
-            for k in range(size):
-                total = np.float32(0.0)
-                for j in range(size):
-                    total += rows[c, k, j] * v[j]
-                out[i, c, k] = total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

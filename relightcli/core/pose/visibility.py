@@ -5,6 +5,10 @@
 with V = 1 where n . w > 0 and nothing lies along w, and 0 elsewhere; no cosine [Nowrouzezahrai 2008, 3.1]. The frame of
 a vertex has its tangent as x axis, normal x tangent as y and the normal as z, and moves with the skin, so that what an
 upper arm sees of the sky changes little as the whole arm turns.
+
+The back of a membrane, or of a surface that is lit from both sides, is a surface of its own that looks along -normal:
+what it passes on is int L V_back max(0, -n . w) dw, and V_back is traced from that side of the skin, in the vertex's
+frame turned by half a turn about the tangent, so that all that is known of fronts holds for backs as well.
 """
 
 from __future__ import annotations
@@ -64,6 +68,11 @@ def trace_visibility(
         blocked = tracer.occluded(origins, towards)
         out[rows] = _seen(blocked.reshape(-1, len(directions)), basis, whole)
     return out, len(position) * len(directions)
+
+
+def both_sides(position: F64, normal: F64, tangent: F64) -> tuple[F64, F64, F64]:
+    """Fronts of V vertices, then their backs: (2 V, 3) each, as `trace_visibility` takes them."""
+    return np.concatenate([position] * 2), np.concatenate([normal, -normal]), np.concatenate([tangent] * 2)
 
 
 @njit(cache=True)

@@ -9,7 +9,6 @@ from relightcli.core.lights.environment import latlong_to_cube
 from relightcli.core.pose.beside import (
     CELLS,
     band_profile,
-    incident_beside,
     lambert_profile,
     shade_beside,
     sky_cells,
@@ -74,16 +73,6 @@ def test_where_all_is_open_it_is_the_closed_product(exponent):
     )
     # Polynomials of degree 9 over cells of 5.6 degrees.
     np.testing.assert_allclose(found, expected, atol=0.02 * expected.max())
-
-
-def test_what_arrives_has_the_bands_of_light_times_visibility():
-    light, order = sky(), 4
-    v = np.random.default_rng(4).normal(size=(3, order**2)).astype(np.float32)
-    table = lighting_matrix(np.ones(order), sh.project_sky(light.flux, light.resolution, 7), order)
-    expected = np.einsum("kjc,vj->vck", table, v)
-    found = incident_beside(v, np.repeat(every(), 3, axis=0), sky_cells(light, order))
-    np.testing.assert_allclose(found, expected, atol=0.02 * np.abs(expected).max())
-    assert (incident_beside(v, np.zeros((3, 6, CELLS, CELLS // 8), np.uint8), sky_cells(light, order)) == 0).all()
 
 
 def test_never_negative_whatever_the_bands_say():

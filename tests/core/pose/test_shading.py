@@ -7,7 +7,7 @@ import pytest
 
 from relightcli.core.pose.lobe_parameters import lobes_of
 from relightcli.core.pose.phong_operator import kernel_factors, phong_factors, phong_matrix
-from relightcli.core.pose.shading import Synthesis, incident, lighting, shade, synthesis, visibility
+from relightcli.core.pose.shading import Synthesis, lighting, shade, synthesis, visibility
 from relightcli.core.pose.zh_lobes import visibility_of
 from relightcli.core.sphere import sh
 
@@ -108,18 +108,6 @@ def test_threads_do_not_matter() -> None:
     light = [lighting(phong_factors(5.0, 7), rng.normal(size=(16, 3)), 4)]
     args = (model, scores, frames, np.ascontiguousarray(frames[:, 2]), np.zeros(VERTICES, np.int32), light)
     np.testing.assert_array_equal(shade(*args), shade(*args, threads=3))
-
-
-def test_incident_light_is_the_product_of_light_and_visibility() -> None:
-    """Even light leaves visibility as it is; other light is what `test_shade_is_the_triple_product` is about."""
-    rng = np.random.default_rng(4)
-    frames = _frames(rng)
-    model, scores, local = _model("log", 4, rng)
-    even = np.zeros((16, 3))
-    even[0] = np.sqrt(4 * math.pi) * np.array([1.0, 2.0, 0.5])
-    found = incident(model, scores, frames, even)
-    expected = _to_world(local, frames)[:, None] * np.array([1.0, 2.0, 0.5])[:, None]
-    np.testing.assert_allclose(found, expected, atol=5e-5)
 
 
 def test_one_pose_turned_is_lit_alike() -> None:

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from relightcli.adapters.rays import Tracer
 from relightcli.core.pose.rig import any_tangents
-from relightcli.core.pose.visibility import hemisphere_directions, hemisphere_harmonics, trace_visibility
+from relightcli.core.pose.visibility import both_sides, hemisphere_directions, hemisphere_harmonics, trace_visibility
 from relightcli.core.sphere.sh import harmonics
 
 ORDER = 4
@@ -78,6 +78,23 @@ def test_a_ball_takes_a_cap_away(height, azimuth):
     cap = zonal(np.sqrt(1 - sine**2), ORDER) * np.sqrt(4 * np.pi / (2 * bands + 1))  # [Funk-Hecke]
     expected = hemisphere_harmonics(ORDER) - np.repeat(cap, 2 * bands + 1) * harmonics(away, ORDER)
     assert close(one(corners, faces), expected)
+
+
+@pytest.mark.parametrize("azimuth", [0.3, 5.0])
+def test_a_ball_behind_is_seen_from_the_back_alone(azimuth):
+    """The back's frame is half a turn about the tangent away: (x, y, z) is (x, -y, -z) there."""
+    height, sine = 0.6, 0.35
+    away = np.array([np.sqrt(1 - height**2) * np.cos(azimuth), np.sqrt(1 - height**2) * np.sin(azimuth), -height])
+    corners, faces = ball(2.0 * away, 2.0 * sine)
+    tracer = Tracer(np.asarray(corners, float), np.asarray(faces, np.int32))
+    skin = both_sides(np.zeros((1, 3)), np.array([[0.0, 0, 1]]), np.array([[1.0, 0, 0]]))
+    (front, back), rays = trace_visibility(tracer, *skin, hemisphere_directions(1024), ORDER)
+    assert rays == 2 * 1024
+    assert np.array_equal(front, hemisphere_harmonics(ORDER).astype(np.float32))
+    bands = np.arange(ORDER)
+    cap = zonal(np.sqrt(1 - sine**2), ORDER) * np.sqrt(4 * np.pi / (2 * bands + 1))  # [Funk-Hecke]
+    seen = np.repeat(cap, 2 * bands + 1) * harmonics(away * [1, -1, -1], ORDER)
+    assert close(back, hemisphere_harmonics(ORDER) - seen)
 
 
 def test_inside_a_ball_nothing_is_seen():
