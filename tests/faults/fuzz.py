@@ -33,7 +33,6 @@ from relight_formats.header import KEY, dump, write_root
 from relightcli.adapters.bvh import load_bvh
 from relightcli.adapters.images import encode_image, read_environment, read_image, read_texture
 from relightcli.adapters.meshes import load_mesh
-from relightcli.adapters.oiio import load_oiio
 from relightcli.adapters.ply import encode_ply
 from relightcli.adapters.rigs import load_rig
 from relightcli.errors import RelightError
@@ -379,7 +378,6 @@ def _where(stacks: str) -> str:
 
 def fuzz(targets: list[Target], folder: Path, seed: int, seconds: float) -> tuple[dict[str, int], list[str]]:
     """Files per target, and the problems found. The targets share the time."""
-    load_oiio().attribute("exr_threads", -1)  # threads of a pool do not come along into a fork
     for target in targets:  # the valid files, so that forks find everything loaded
         for k, data in enumerate(target.seeds):
             path = folder / f"valid{k}{target.suffix}"
