@@ -418,11 +418,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="tests.faults.fuzz")
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--results", type=Path, help="file of figures to be written")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory(dir="/dev/shm" if os.path.isdir("/dev/shm") else None) as name:
         folder = Path(name)
         targets = all_targets(folder)
         count, problems = fuzz(targets, folder, asked.seed, 60.0 * asked.minutes)
+    if asked.results:
+        found = {"seed": asked.seed, "minutes": asked.minutes, "files": count, "problems": problems}
+        asked.results.parent.mkdir(parents=True, exist_ok=True)
+        asked.results.write_text(json.dumps(found, indent=1) + "\n")
     for target, files in count.items():
         print(f"{target}: {files} files")
     print(*problems, sep="\n")

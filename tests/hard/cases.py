@@ -48,6 +48,7 @@ CASES: dict[str, tuple[tuple[str, tuple[str, ...]], ...]] = {
             (
                 f"{_}light.py::test_black",
                 f"{_}light.py::test_one_pixel_map_is_the_constant_map",
+                f"{_}paths.py::test_black_and_one_pixel",
                 f"{_}light.py::test_constant_sky_gives_lambert_its_albedo_where_nothing_blocks",
             ),
         ),
@@ -55,6 +56,7 @@ CASES: dict[str, tuple[tuple[str, tuple[str, ...]], ...]] = {
             "a sun of 1e6 in one texel, at seams and poles",
             (
                 f"{_}light.py::test_one_texel_sun",
+                f"{_}paths.py::test_sun_beside_a_dark_sky",
                 f"{_}light.py::test_texels_at_the_poles_count_by_their_solid_angle",
             ),
         ),
@@ -73,6 +75,7 @@ CASES: dict[str, tuple[tuple[str, tuple[str, ...]], ...]] = {
             (
                 f"{_}light.py::test_reflectances",
                 f"{_}light.py::test_reflectances_by_the_reference",
+                f"{_}paths.py::test_materials_at_their_extremes",
                 f"{_}assets.py::test_extremes_are_bounded_and_near_the_transfer_store",
             ),
         ),

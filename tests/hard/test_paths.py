@@ -12,7 +12,17 @@ import pytest
 
 from relightcli.stages import cluster, factorize, fit_pose, light_clusters
 from tests.core.transport.scenes import lambert, sphere, square
-from tests.hard.test_invariants import CAMERA, apart, layers, quarter, shiny, shuffled_faces, shuffled_vertices, sky
+from tests.hard.test_invariants import (
+    CAMERA,
+    GOLD,
+    apart,
+    layers,
+    quarter,
+    shiny,
+    shuffled_faces,
+    shuffled_vertices,
+    sky,
+)
 from tests.hard.test_invariants import turned as turned_part
 from tests.stages.pose_files import SCENE, pose_scene
 from tests.stages.scene_files import make_store, write_scene
@@ -20,7 +30,7 @@ from tests.stages.scene_files import make_store, write_scene
 PATHS = ("haar", "sh", "clusters", "asset", "light clusters", "moved", "posed")
 SETTINGS = {"light_resolution": 16, "subdivide": False}
 BOUNCE = {"bounces": 1, "bounce_resolution": 8}
-PLACE = np.array([0.3, 0.75, 0.2])  # where the ball is moved to
+PLACE = np.array([0.3, 0.75, 0.2])  # where a ball is moved to
 POSE = "bar=bend@1.3"
 
 
@@ -105,7 +115,7 @@ class Places:
     def moved(self, change):
         parts = {
             "floor": square(3.0, material=lambert(0.5)),
-            "post": sphere(0.25, (-0.6, 0.3, 0), rings=6, material=lambert(0.6)),
+            "gold": sphere(0.25, (-0.6, 0.3, 0), rings=6, material=GOLD),
             "ball": sphere(0.4, (0, 0, 0), rings=8, material=lambert(0.7)),
         }
         path = self.scene("moved", change, parts)
@@ -182,18 +192,55 @@ def test_turned_with_its_sky(places, within, path):
     within(f"{path}: turned, rms", float(np.sqrt((difference**2).mean()) / wanted.max()), 5e-3)
 
 
-WHITE = {
-    "moved": ("floor.diffuse=1,1,1", "post.diffuse=1,1,1", "ball.diffuse=1,1,1"),
+MATTE = ("floor.diffuse=1,1,1", "gold.diffuse=1,1,1", "gold.specular=0,0,0")
+WHITE = dict.fromkeys(PATHS, (*MATTE, "lacquer.diffuse=1,1,1", "lacquer.specular=0,0,0")) | {
+    "moved": (*MATTE, "ball.diffuse=1,1,1"),
     "posed": ("grey.diffuse=1,1,1", "red.diffuse=1,1,1"),
 }
-MATTE = ("floor.diffuse=1,1,1", "gold.diffuse=1,1,1", "gold.specular=0,0,0")
-MATTE = (*MATTE, "lacquer.diffuse=1,1,1", "lacquer.specular=0,0,0")
+EVEN = np.ones((4, 8, 3))
 
 
 @pytest.mark.parametrize("path", PATHS)
 def test_white_is_not_brighter_than_its_sky(places, within, path):
     """Furnace: what is white under a white sky gives back no more than it, and all of it where nothing is above: 1 %
     is the quadrature of a clamped cosine by 16 texels a side."""
-    found = places.picture(path, pixels=np.ones((4, 8, 3)), settings=WHITE.get(path, MATTE))
+    found = places.picture(path, pixels=EVEN, settings=WHITE[path])
     within(f"{path}: above 1", float(found[""].max() - 1.0), 0.01)
     within(f"{path}: brightest below 1", float(1.0 - found[""].max()), 0.01)
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_black_and_one_pixel(places, within, path):
+    """Nothing gives nothing. One pixel says what many of the same say: 1e-5 is what taking a map to the cube keeps."""
+    assert (places.picture(path, pixels=np.zeros((4, 8, 3)))[""] == 0).all()
+    one, many = (places.picture(path, pixels=pixels)[""] for pixels in (np.ones((1, 1, 3)), EVEN))
+    within(f"{path}: one pixel or many", apart(one, many), 1e-5)
+
+
+@pytest.mark.parametrize("texel", [(0, 7), (3, 5)], ids=["pole", "sky"])
+@pytest.mark.parametrize("path", PATHS)
+def test_sun_beside_a_dark_sky(places, within, path, texel):
+    """A texel of 1e6 beside 1e-3: apart they add up to both. Under the sun alone single pixels hold all light there is,
+    so that sums of float32 lose 1e-6 of it, and lobes are treated alike, as in `test_two_skies`."""
+    sun, dark = np.zeros((16, 32, 3)), np.full((16, 32, 3), 1e-3)
+    sun[texel] = 1e6
+    dark[texel] = 0.0
+    alone = places.picture(path, pixels=sun)[""].astype(np.float64)
+    total = alone + places.picture(path, pixels=dark)[""]
+    within(f"{path}: sun and sky", apart(total, places.picture(path, pixels=sun + dark)[""]), 2e-3)
+    # Albedos are below 1, and a mirror shows the sun itself at the most.
+    within(f"{path}: brighter than the sun", float(alone.max()), 1e6)
+
+
+SHARP = ("gold.roughness=1e-4", "gold.f0=1", "lacquer.shininess=1e6")
+DULL = ("gold.roughness=10", "gold.f0=0", "lacquer.shininess=0")
+
+
+@pytest.mark.parametrize("edit", [SHARP, DULL], ids=["sharp", "dull"])
+@pytest.mark.parametrize("path", [p for p in PATHS if p != "posed"])
+def test_materials_at_their_extremes(places, within, path, edit):
+    """Under an even sky of 1 gold gives back 0.9 of it at most, lacquer 0.6 and what Blinn-Phong gains towards grazing
+    views, below twice its specular colour: 0.9; one reflection of the floor's 0.4 is in what falls on them already.
+    The 8 bits of an asset's values lose 1 % (its own `total` error)."""
+    found = places.picture(path, pixels=EVEN, settings=[e for e in edit if path != "moved" or e.startswith("gold")])
+    within(f"{path}: brightest", float(found[""].max()), 0.9 * 1.01 if path == "asset" else 0.9)
