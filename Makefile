@@ -62,7 +62,7 @@ faults: $(VENV)/.test  ## every command killed, starved and damaged; goes on whe
 	$(BIN)/python -m tests.faults.campaign --kills $(KILLS) --corruptions $(CORRUPTIONS) --others $(OTHERS) --seed $(SEED) --results build/faults/seed-$(SEED).jsonl
 
 fuzz: $(VENV)/.test  ## files of strangers: every parser on mutated files
-	$(BIN)/python -m tests.faults.fuzz --minutes $(MINUTES) --seed $(SEED)
+	$(BIN)/python -m tests.faults.fuzz --minutes $(MINUTES) --seed $(SEED) --results build/fuzz.json
 
 clean:
 	rm -rf $(VENV) demo tradeoff build

@@ -17,11 +17,15 @@ from relight_formats.files import LOCK, sibling
 _held: "weakref.WeakSet[Lock]" = weakref.WeakSet()
 
 
+class Busy(StoreError):
+    """Another writer has the lock."""
+
+
 class Lock:
     """Held from construction until `release`.
 
     Raises:
-        StoreError: another process (or another writer of this one) holds it.
+        Busy: another process (or another writer of this one) holds it.
         OSError: the folder does not exist or cannot be written.
     """
 
@@ -41,7 +45,7 @@ class Lock:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 holder = os.pread(descriptor, 200, 0).decode("utf-8", "replace").strip() or "unknown"
-                raise StoreError(
+                raise Busy(
                     f"{store}: another process is writing this store ({holder}). Wait for it to end, or stop it; "
                     f"the lock goes with the process."
                 ) from None

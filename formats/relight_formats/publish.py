@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from relight_formats.errors import StoreError
-from relight_formats.files import REPLACED, fsync_folder, remove_store, sibling
+from relight_formats.files import REPLACED, fsync_folder, local_path, remove_store, sibling
 from relight_formats.header import is_store, read_root
 from relight_formats.ledger import DOCUMENTS, FILE_NAME
+from relight_formats.lock import Busy, Lock
 from relight_formats.store import need_whole
 
 
@@ -33,10 +34,35 @@ def publish(path: Path, partial: Path) -> None:
 
 def discard(path: Path, folder: Path) -> None:
     """Delete unfinished work on `path`, or the store at `path` itself. One rename first: half of a deleted store is
-    never taken for a whole one."""
+    never taken for a whole one. Needs the writer's lock."""
     replaced = sibling(path, REPLACED)
     os.rename(folder, replaced)
     remove_store(replaced)
+
+
+def drop(path: Path) -> None:
+    """Delete the finished store at `path`, which has served. Gone already: nothing is done; nor while another writer
+    has its lock: what is there is then that writer's to delete.
+
+    Raises:
+        StoreError: `NAME.replaced` is in the way and is no relight store.
+    """
+    path = local_path(path)
+    if not path.exists():
+        return
+    try:
+        lock = Lock(path)
+    except Busy:
+        return
+    try:
+        replaced = sibling(path, REPLACED)
+        if replaced.exists():  # a crash came in the midst of this
+            _need_ours(replaced)
+            remove_store(replaced)
+        if path.exists():
+            discard(path, path)
+    finally:
+        lock.release()
 
 
 def tidy(path: Path, partial: Path) -> bool:

@@ -140,7 +140,7 @@ def _frames(path: Path, lines: list[str], start: int, width: int) -> tuple[F64, 
         except ValueError:
             raise InputError(f"{path}: expected {key!r} with a number after MOTION, found {line[:40]!r}.") from None
     count, step = head["Frames:"], head["Frame Time:"]
-    if not count >= 1 or count != int(count) or not 0.0 < step < 1e6:
+    if not (count >= 1 and count.is_integer() and 0.0 < step < 1e6):
         raise InputError(f"{path}: expected a whole number of frames and a time above 0, found {count:g} and {step:g}.")
     try:
         values = np.array(" ".join(rest[2:]).split(), dtype=np.float64)

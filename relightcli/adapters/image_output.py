@@ -43,7 +43,11 @@ def write_image(
 
     Raises InputError for an unknown suffix or a missing folder; OSError (disk full, no permission) as it comes.
     """
-    data = encode_image(Path(path).suffix, pixels, layers=layers, metadata=metadata, exposure=exposure)
+    try:
+        data = encode_image(Path(path).suffix, pixels, layers=layers, metadata=metadata, exposure=exposure)
+    except OSError as error:
+        error.filename = str(path)  # it was the memory file's
+        raise
     write_atomic(path, data)
 
 
@@ -168,9 +172,21 @@ def _encode_linear(suffix: str, pixels: NDArray[np.float32], names: list[str], m
         fine = fine and target.write_image(np.ascontiguousarray(pixels))
         fine = fine and target.close()
         if not fine:
+            _need_room(name, pixels.nbytes)
             trouble = target.geterror() if target is not None else oiio.geterror()
             raise SystemFault(f"could not encode a {suffix} picture ({first_line(trouble)}).")
+        _need_room(name, 0)
         return read()
+
+
+def _need_room(name: str, size: int) -> None:
+    """Raises OSError where the file cannot be longer than it is and than `size` bytes: the system's reason, which the
+    library does not pass on. Files in memory are under a limit on file sizes as others are; writers of TIFF and of HDR
+    end well when it has cut off what they wrote last."""
+    with contextlib.suppress(FileNotFoundError):
+        end = os.stat(name).st_size
+        os.truncate(name, max(end, size) + 2)  # 2: a TIFF's directory begins at an even place
+        os.truncate(name, end)
 
 
 def _round_to_rgbe(rgb: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 import relight_formats as formats
-from relight_formats.publish import discard
+from relight_formats.publish import drop
 from relightcli import __version__
 from relightcli.adapters import images
 from relightcli.adapters.rays import Tracer
@@ -208,7 +208,7 @@ def render_reference(config: Config, shots: list[Shot], suffix: str, started: fl
         if shot.poses:
             metadata["relight:pose"] = " ".join(shot.poses)
         written.append(put_picture(config, shot, suffix, pixels, extra, metadata))
-        discard(samples, samples)
+        drop(samples)
     return {
         "store": str(config.store),
         "output": written if config.frames else written[0],

@@ -68,6 +68,7 @@ def test_joints_offsets_and_channels(tmp_path):
         ("}\nMOTION", "MOTION", "is it cut short"),
         ("Frames: 2", "Frames: two", "expected 'Frames:' with a number"),
         ("Frames: 2", "Frames: 0", "whole number of frames"),
+        ("Frames: 2", "Frames: 1e999", "whole number of frames and a time above 0, found inf"),
         ("Frames: 2", "Frames: 3", "expected 3 frames of 10 finite numbers, found 20"),
         ("Frame Time: 0.25", "Frame Time: 0", "a time above 0"),
         ("1 2 3 0", "1 2 nan 0", "1 of them not finite"),

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import resource
 
 import numpy as np
 import OpenImageIO as oiio
@@ -309,3 +310,25 @@ def test_primaries_of_another_kind(tmp_path):
     buffer = oiio.ImageBuf(spec)
     assert buffer.write(str(tmp_path / "a.exr"))
     assert "primaries are not Rec.709" in read_image(tmp_path / "a.exr").notes[0]
+
+
+@pytest.mark.parametrize("suffix", [".exr", ".tif", ".hdr", ".png"])
+@pytest.mark.parametrize("short", [1, 2, 3, 100, 3000, 30_000, None], ids=lambda s: "all" if s is None else str(s))
+def test_a_limit_on_file_sizes_is_told_as_such(tmp_path, suffix, short):
+    """Files in memory, in which pictures are made, are under it too: some libraries say no more than that they failed,
+    and some do not notice that the last bytes are missing."""
+    noise = np.random.default_rng(2).random((64, 64, 3)).astype(np.float32)
+    whole = encode_image(suffix, noise)
+    path = tmp_path / f"out{suffix}"
+    old = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (max(0, len(whole) - short) if short else 0, old[1]))
+    try:
+        with pytest.raises(OSError, match="File too large") as caught:
+            write_image(path, noise)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, old)
+    assert caught.value.errno == errno.EFBIG
+    assert caught.value.filename == str(path)
+    assert not list(tmp_path.iterdir())
+    write_image(path, noise)
+    assert path.read_bytes() == whole

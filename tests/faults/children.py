@@ -193,8 +193,17 @@ def calls(at: int, what: Callable[[], None]) -> Callable[[int, str, str], None]:
 
 
 def one_thread(module: str) -> None:
-    """Starts this program, a module, again unless NumPy's libraries have no threads: forks would wait for them."""
+    """Starts this program, a module, again unless NumPy's libraries have no threads: forks would wait for them. Nor has
+    OpenImageIO, from here on.
+
+    Before its first picture: where OpenEXR's pool has threads already, a fork that is the first to want none joins
+    those of its parent. They are not there: it fails, or waits for ever for a new thread that has got the place of one.
+    """
     names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
     if missing := [name for name in names if os.environ.get(name) != "1"]:
         os.environ |= dict.fromkeys(missing, "1")
         os.execv(sys.executable, [sys.executable, "-m", module, *sys.argv[1:]])
+    from relightcli.adapters.oiio import load_oiio
+
+    load_oiio().attribute("threads", 1)
+    load_oiio().attribute("exr_threads", -1)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import faulthandler
 import json
 import os
 import random
@@ -32,7 +33,6 @@ from relight_formats.header import KEY, dump, write_root
 from relightcli.adapters.bvh import load_bvh
 from relightcli.adapters.images import encode_image, read_environment, read_image, read_texture
 from relightcli.adapters.meshes import load_mesh
-from relightcli.adapters.oiio import load_oiio
 from relightcli.adapters.ply import encode_ply
 from relightcli.adapters.rigs import load_rig
 from relightcli.errors import RelightError
@@ -50,7 +50,7 @@ from tests.stages.scene_files import make_store, write_scene
 
 SECONDS = 2.0  # of computing, for one file
 MEMORY = 1 << 30  # beyond what the process has
-PATIENCE = 30.0  # seconds that a fork may be late
+PATIENCE = 30.0  # seconds that a fork may wait, or compute beyond its time
 SLICE = 200  # files from one fork
 TOKENS = (
     b"1e999",
@@ -305,7 +305,7 @@ def attempt(target: Target, folder: Path, rng: random.Random) -> str:
         raise TooSlow
 
     old = signal.signal(signal.SIGPROF, late)
-    signal.setitimer(signal.ITIMER_PROF, SECONDS)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS, SECONDS)  # again, for it may come where exceptions are dropped
     try:
         target.read(path)
     except RelightError:
@@ -320,8 +320,9 @@ def attempt(target: Target, folder: Path, rng: random.Random) -> str:
     return ""
 
 
-def _slice(target: Target, folder: Path, seed: int, first: int, until: float, told: int) -> None:
+def _slice(target: Target, folder: Path, seed: int, first: int, until: float, told: int, stacks: int) -> None:
     """In a fork: files `first` to `first` + SLICE, each problem as a line, and the number of files at the end."""
+    faulthandler.register(signal.SIGUSR1, stacks)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY, used + MEMORY))
     for number in range(first, first + SLICE):
@@ -334,20 +335,49 @@ def _slice(target: Target, folder: Path, seed: int, first: int, until: float, to
             break
 
 
-def _wait(pid: int, deadline: float) -> int:
-    """Exit status of a fork, which is killed when it is late: it waits for something that does not come."""
+def _wait(pid: int, until: float) -> tuple[int, str]:
+    """Exit status of a fork, and what was wrong when it had to be killed: it waited for something that does not come,
+    or computed without an end. One whose turn has not come yet, on a busy machine, does neither."""
+    known, since = -1.0, until
+    late = None
     while True:
         found, status = os.waitpid(pid, os.WNOHANG)
         if found:
-            return status
-        if time.monotonic() > deadline:
-            os.kill(pid, signal.SIGKILL)
+            return status, ""
+        now = time.monotonic()
+        if now > until:
+            computed, waits = _doing(pid)
+            late = computed if late is None else late
+            if computed != known or not waits:
+                known, since = computed, now
+            problem = "waits" if now - since > PATIENCE else "computes" if computed - late > PATIENCE else ""
+            if problem:
+                os.kill(pid, signal.SIGUSR1)  # it tells where
+                time.sleep(1.0)
+                os.kill(pid, signal.SIGKILL)
+                return os.waitpid(pid, 0)[1], f"{problem} without an end"
         time.sleep(0.005)
+
+
+def _doing(pid: int) -> tuple[float, bool]:
+    """Seconds that a process has computed, and whether all of its threads wait."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    seconds = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    states = []
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        with contextlib.suppress(OSError):  # it has just ended
+            states.append((task / "stat").read_text().rpartition(")")[2].split()[0])
+    return seconds, "R" not in states and "D" not in states
+
+
+def _where(stacks: str) -> str:
+    """The innermost places of every thread, from what faulthandler writes."""
+    threads = [re.findall(r'File "[^"]*?([^"/]+)", line (\d+) in (\S+)', text) for text in stacks.split("hread ")]
+    return "; ".join(" < ".join(f"{f}:{line} {name}" for f, line, name in places[:6]) for places in threads if places)
 
 
 def fuzz(targets: list[Target], folder: Path, seed: int, seconds: float) -> tuple[dict[str, int], list[str]]:
     """Files per target, and the problems found. The targets share the time."""
-    load_oiio().attribute("exr_threads", -1)  # threads of a pool do not come along into a fork
     for target in targets:  # the valid files, so that forks find everything loaded
         for k, data in enumerate(target.seeds):
             path = folder / f"valid{k}{target.suffix}"
@@ -357,23 +387,27 @@ def fuzz(targets: list[Target], folder: Path, seed: int, seconds: float) -> tupl
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         for target in targets:
-            with tempfile.TemporaryFile() as told:
+            with tempfile.TemporaryFile() as told, tempfile.TemporaryFile() as stacks:
                 until = min(end, time.monotonic() + max(0.2, seconds / (10 * len(targets))))
                 pid = os.fork()
                 if pid == 0:
                     try:
                         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libraries complain about every file
-                        _slice(target, folder, seed, count[target.name], until, told.fileno())
+                        _slice(target, folder, seed, count[target.name], until, told.fileno(), stacks.fileno())
                         os._exit(0)
                     finally:
                         os._exit(1)
-                status = _wait(pid, until + PATIENCE)
+                status, late = _wait(pid, until)
                 told.seek(0)
+                stacks.seek(0)
                 first, *lines = told.read().decode().splitlines()
                 problems += lines
                 if status:
                     number = count[target.name] + int(first)
-                    problems.append(f"{target.name} {number}: ends the process ({os.waitstatus_to_exitcode(status)})")
+                    how = f"ends the process ({os.waitstatus_to_exitcode(status)})"
+                    if late:
+                        how = f"{late}: {_where(stacks.read().decode())}"
+                    problems.append(f"{target.name} {number}: {how}")
                 count[target.name] += int(first) + 1
             if time.monotonic() > end:
                 break
@@ -384,11 +418,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="tests.faults.fuzz")
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--results", type=Path, help="file of figures to be written")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory(dir="/dev/shm" if os.path.isdir("/dev/shm") else None) as name:
         folder = Path(name)
         targets = all_targets(folder)
         count, problems = fuzz(targets, folder, asked.seed, 60.0 * asked.minutes)
+    if asked.results:
+        found = {"seed": asked.seed, "minutes": asked.minutes, "files": count, "problems": problems}
+        asked.results.parent.mkdir(parents=True, exist_ok=True)
+        asked.results.write_text(json.dumps(found, indent=1) + "\n")
     for target, files in count.items():
         print(f"{target}: {files} files")
     print(*problems, sep="\n")

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import random
+import tempfile
+import threading
 import time
 
 import pytest
@@ -58,6 +61,33 @@ def test_what_a_parser_must_not_do_is_found(tmp_path):
         assert "takes more than 0.2 s" in once(b"l")
     finally:
         fuzz.SECONDS = old
+
+
+@pytest.mark.parametrize("kind", ["waits", "computes"])
+def test_a_fork_that_does_not_end_is_told_with_the_place(tmp_path, monkeypatch, kind):
+    monkeypatch.setattr(fuzz, "PATIENCE", 0.3)
+    # An endless loop that no exception leaves, as one in a library.
+    monkeypatch.setattr(fuzz.signal, "setitimer", lambda *args: None)
+
+    def read(path):
+        if kind == "waits":
+            threading.Event().wait()
+        while True:
+            time.perf_counter()
+
+    target = fuzz.Target("t", ".t", (b"12345678",), read)
+    with tempfile.TemporaryFile() as told, tempfile.TemporaryFile() as stacks:
+        pid = os.fork()
+        if pid == 0:
+            fuzz._slice(target, tmp_path, 0, 0, time.monotonic(), told.fileno(), stacks.fileno())
+            os._exit(0)
+        status, late = fuzz._wait(pid, time.monotonic())
+        stacks.seek(0)
+        where = fuzz._where(stacks.read().decode())
+    assert status == 9
+    assert late == f"{kind} without an end"
+    assert "test_fuzz.py" in where
+    assert " read" in where
 
 
 class Unchanged(random.Random):

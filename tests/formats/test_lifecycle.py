@@ -13,6 +13,9 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from relight_formats import Status, StoreError, Writer, open_store
+from relight_formats.files import REPLACED, sibling
+from relight_formats.lock import Lock
+from relight_formats.publish import drop
 from tests.formats.jobs import PER_BLOCK, start, values, write
 
 
@@ -106,3 +109,44 @@ class Lifecycle(RuleBasedStateMachine):
 TestLifecycle = Lifecycle.TestCase
 # Each step writes and syncs files; 25 sequences of 12 steps take a few seconds and reach every pair of rules.
 TestLifecycle.settings = settings(max_examples=25, stateful_step_count=12, deadline=None)
+
+
+def finished(path):
+    with start(path) as writer:
+        write(writer)
+        writer.commit({})
+
+
+def test_dropped_store_leaves_nothing(tmp_path):
+    path = tmp_path / "store.zarr"
+    finished(path)
+    shutil.copytree(path, sibling(path, REPLACED))  # as a crash in the midst of it leaves
+    drop(path)
+    assert not list(tmp_path.iterdir())
+    drop(path)  # gone already, as when two programs had the same use for it
+
+
+def test_dropped_store_is_left_to_a_writer_at_work(tmp_path):
+    path = tmp_path / "store.zarr"
+    finished(path)
+    with start(path, 2.0, overwrite=True) as writer:
+        drop(path)
+        assert open_store(path).settings["factor"] == 1.0
+        write(writer, 2.0)
+        writer.commit({})
+    assert open_store(path).settings["factor"] == 2.0
+
+
+def test_what_another_writer_takes_between_two_looks_is_its_own(tmp_path, monkeypatch):
+    """The store goes after it was seen and before the lock is held."""
+    path = tmp_path / "store.zarr"
+    finished(path)
+
+    class Late(Lock):
+        def __init__(self, store):
+            shutil.rmtree(store)
+            super().__init__(store)
+
+    monkeypatch.setattr("relight_formats.publish.Lock", Late)
+    drop(path)
+    assert not list(tmp_path.iterdir())

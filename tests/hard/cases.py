@@ -4,6 +4,7 @@ from __future__ import annotations
 
 _ = "tests/hard/test_"
 _CORE = "tests/core/"
+_FAULTS = "tests/faults/test_"
 
 # Section, then (case, its tests). A test is FILE::FUNCTION, all of its variants.
 CASES: dict[str, tuple[tuple[str, tuple[str, ...]], ...]] = {
@@ -21,7 +22,7 @@ CASES: dict[str, tuple[tuple[str, tuple[str, ...]], ...]] = {
         ),
         (
             "sizes 1e-6 to 1e6, and powers of two to the bit",
-            (f"{_}geometry.py::test_scale", f"{_}invariants.py::test_size"),
+            (f"{_}geometry.py::test_scale", f"{_}invariants.py::test_size", f"{_}paths.py::test_any_size"),
         ),
         ("far from the origin", (f"{_}geometry.py::test_far_from_the_origin",)),
         (
@@ -47,6 +48,7 @@ CASES: dict[str, tuple[tuple[str, tuple[str, ...]], ...]] = {
             (
                 f"{_}light.py::test_black",
                 f"{_}light.py::test_one_pixel_map_is_the_constant_map",
+                f"{_}paths.py::test_black_and_one_pixel",
                 f"{_}light.py::test_constant_sky_gives_lambert_its_albedo_where_nothing_blocks",
             ),
         ),
@@ -54,6 +56,7 @@ CASES: dict[str, tuple[tuple[str, tuple[str, ...]], ...]] = {
             "a sun of 1e6 in one texel, at seams and poles",
             (
                 f"{_}light.py::test_one_texel_sun",
+                f"{_}paths.py::test_sun_beside_a_dark_sky",
                 f"{_}light.py::test_texels_at_the_poles_count_by_their_solid_angle",
             ),
         ),
@@ -72,6 +75,7 @@ CASES: dict[str, tuple[tuple[str, tuple[str, ...]], ...]] = {
             (
                 f"{_}light.py::test_reflectances",
                 f"{_}light.py::test_reflectances_by_the_reference",
+                f"{_}paths.py::test_materials_at_their_extremes",
                 f"{_}assets.py::test_extremes_are_bounded_and_near_the_transfer_store",
             ),
         ),
@@ -157,6 +161,54 @@ CASES: dict[str, tuple[tuple[str, tuple[str, ...]], ...]] = {
         ),
         ("a skin that collapses", (f"{_CORE}pose/test_rig.py::test_a_skin_that_collapses_still_has_frames",)),
     ),
+    "Files": (
+        (
+            "truncated, emptied, deleted, flipped bits, chunks exchanged",
+            (
+                f"{_FAULTS}damage.py::test_every_file_is_guarded",
+                f"{_FAULTS}damage.py::test_exchanged_chunks",
+                f"{_FAULTS}damage.py::test_files_that_do_not_belong",
+            ),
+        ),
+        ("of another version", (f"{_FAULTS}damage.py::test_another_version",)),
+        (
+            "of another scene or settings, or changed midway",
+            (
+                f"{_FAULTS}damage.py::test_other_inputs_or_settings",
+                f"{_FAULTS}damage.py::test_an_input_changed_while_work_was_interrupted",
+                f"{_FAULTS}damage.py::test_an_input_changed_while_it_was_read",
+            ),
+        ),
+        (
+            "read-only, unreadable, a full disk",
+            (
+                f"{_FAULTS}machine.py::test_read_only_folder",
+                f"{_FAULTS}machine.py::test_unreadable_inputs",
+                f"{_FAULTS}machine.py::test_full_disk",
+                f"{_FAULTS}machine.py::test_full_disk_under_a_picture",
+            ),
+        ),
+        (
+            "two writers",
+            (f"{_FAULTS}kill.py::test_two_writers", f"{_FAULTS}pictures.py::test_two_relights_at_once"),
+        ),
+        (
+            "killed at any moment",
+            (
+                f"{_FAULTS}kill.py::test_killed_at_random_moments",
+                f"{_FAULTS}kill.py::test_interrupted",
+                f"{_FAULTS}pictures.py::test_killed_while_writing_a_sequence",
+                f"{_FAULTS}campaign.py::test_a_sample",
+            ),
+        ),
+        (
+            "from strangers: every parser on changed files",
+            (
+                f"{_FAULTS}fuzz.py::test_changed_files_are_read_or_refused",
+                "tests/formats/test_untrusted.py::test_*",
+            ),
+        ),
+    ),
     "Invariants": (
         (
             "furnace",
@@ -164,6 +216,7 @@ CASES: dict[str, tuple[tuple[str, tuple[str, ...]], ...]] = {
                 f"{_}invariants.py::test_white_under_a_white_sky",
                 f"{_}geometry.py::test_furnace_over_anything_convex",
                 f"{_}assets.py::test_white_closed_box_is_bounded",
+                f"{_}paths.py::test_white_is_not_brighter_than_its_sky",
             ),
         ),
         (
@@ -172,11 +225,22 @@ CASES: dict[str, tuple[tuple[str, tuple[str, ...]], ...]] = {
                 f"{_}invariants.py::test_linear_in_brightness",
                 f"{_}invariants.py::test_sum_of_two_skies",
                 f"{_}light.py::test_light_is_linear_in_brightness",
+                f"{_}paths.py::test_brightness",
+                f"{_}paths.py::test_two_skies",
             ),
         ),
-        ("layers add up", (f"{_}invariants.py::test_layers_add_up_to_the_picture",)),
-        ("scene and sky turned together", (f"{_}invariants.py::test_scene_and_sky_turn_together",)),
-        ("order of vertices and of faces", (f"{_}invariants.py::test_order_in_the_file",)),
+        (
+            "layers add up",
+            (f"{_}invariants.py::test_layers_add_up_to_the_picture", f"{_}paths.py::test_layers_add_up"),
+        ),
+        (
+            "scene and sky turned together",
+            (f"{_}invariants.py::test_scene_and_sky_turn_together", f"{_}paths.py::test_turned_with_its_sky"),
+        ),
+        (
+            "order of vertices and of faces",
+            (f"{_}invariants.py::test_order_in_the_file", f"{_}paths.py::test_any_order"),
+        ),
         (
             "what no light reaches neither gets nor gives",
             (f"{_}assets.py::test_what_no_light_reaches_neither_gets_nor_gives",),

@@ -48,6 +48,17 @@ def test_the_page_has_every_case_and_kernel():
     assert "FAILED" not in text
 
 
+def test_what_was_not_run_stays_as_it_was():
+    ran, other = nodes()[:2]
+    rows = [{"node": f"{ran}[a]", "outcome": "passed", "figures": [["x", 0.5, 1.0]]}]
+    page = table([{"node": other, "outcome": "passed", "figures": [["y", 2.0, 4.0]]}])
+    text = table(rows, page)
+    assert f"`{ran}` | 1 passed | x: 0.5, at most 1 |" in text
+    assert f"`{other}` | 1 passed | y: 2, at most 4 |" in text
+    assert text.count("passed") == 2
+    assert table([], PAGE.read_text()) in PAGE.read_text()
+
+
 def test_a_failure_shows():
     node = nodes()[0]
     rows = [{"node": f"{node}[a]", "outcome": "failed", "figures": [["x", 2.0, 1.0], ["y", 0.1, 1.0]]}]

@@ -39,11 +39,11 @@ def bowl(rings=12):
     }
 
 
-def shiny():
+def shiny(rings=10):
     return {
         "floor": square(4.0, material=lambert(0.4)),
-        "gold": sphere(0.4, (-0.45, 0.5, 0.1), rings=10, material=GOLD),
-        "lacquer": sphere(0.3, (0.4, 0.5, 0.3), rings=10, material=LACQUER),
+        "gold": sphere(0.4, (-0.45, 0.5, 0.1), rings=rings, material=GOLD),
+        "lacquer": sphere(0.3, (0.4, 0.5, 0.3), rings=rings, material=LACQUER),
     }
 
 

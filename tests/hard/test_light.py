@@ -116,17 +116,21 @@ EXTREMES = [
 @pytest.mark.parametrize("sky", SKIES)
 @pytest.mark.parametrize(("model", "parameter", "value"), EXTREMES)
 def test_reflectances(store, model, parameter, value, sky):
-    """No NaN, nothing negative, and under an even sky no more than 2 times its light: diffuse 0.3 and specular 0.5 give
+    """No NaN, nothing negative, and no more than 2 times the brightest of the sky: diffuse 0.3 and specular 0.5 give
     0.8 at most where the lobe keeps its energy; Blinn-Phong and Phong gain towards grazing views."""
     rgb = lit(store, SKIES[sky], settings=(f"{model}.{parameter}={value}",))
-    if sky == "even":
-        assert rgb.max() < 2.0
+    assert rgb.max() < 2.0 * SKIES[sky].max()
 
 
 @pytest.mark.parametrize("sky", SKIES)
 @pytest.mark.parametrize(("model", "parameter", "value"), EXTREMES)
 def test_reflectances_by_the_reference(store, model, parameter, value, sky):
-    lit(store, SKIES[sky], settings=(f"{model}.{parameter}={value}",), reference=True, spp=8, bounces=2)
+    """The same of path tracing. Two interreflections give 0.8 of what they get again: 1 + 0.8 + 0.64 times as much. A
+    sample of a narrow lobe weighs its albedo, of the sun its radiance times the lobe: single ones may be as bright as
+    the lobe is high, so that under the sun only the even sky's bound is asked of what is not narrow."""
+    rgb = lit(store, SKIES[sky], settings=(f"{model}.{parameter}={value}",), reference=True, spp=8, bounces=2)
+    if sky == "even":
+        assert rgb.max() < 2.0 * (1 + 0.8 + 0.64)
 
 
 @pytest.mark.parametrize("model", MODELS)
