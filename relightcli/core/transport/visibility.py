@@ -332,7 +332,7 @@ def _fill(normals, directions, first, centers, reach, resolution, refine, state,
 
 
 @njit(cache=True)
-def _cell_rays(
+def _cell_rays(  # type: ignore[no-untyped-def]
     origins,
     normals,
     directions,
@@ -348,7 +348,7 @@ def _cell_rays(
     out_o,
     out_d,
     target,
-):  # type: ignore[no-untyped-def]
+):
     """Rays of all texels above the horizon of the marked cells; `target` is their bit in the words of all receivers.
 
     A probed texel needs no second ray: its bit is set here.
