@@ -128,18 +128,6 @@ def test_commands_load_stages_only_when_they_run(name):
         assert not module.startswith("relightcli.stages"), f"{name}:{line}: {module}"
 
 
-def test_slow_libraries_load_where_they_are_used():
-    # SciPy and trimesh take a third of the time that a command needs to start; most commands need neither.
-    slow = {"scipy", "trimesh", "matplotlib", "OpenImageIO", "embreex"}
-    found = [
-        f"{path.relative_to(PACKAGE.parent)}:{line}: {module}"
-        for path in FILES
-        for module, line in imports(path, top_level_only=True)
-        if module.split(".")[0] in slow
-    ]
-    assert not found, "\n".join(found)
-
-
 def test_the_store_format_knows_nothing_of_the_program():
     import relight_formats
 

@@ -31,6 +31,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from relightcli.core.brdf.albedo import directional_albedo, lobe_share
 from relightcli.core.brdf.dataset import BrdfSet, blinn_phong_set, cook_torrance_set
@@ -272,8 +273,6 @@ class _Nodes(NamedTuple):
 
 @lru_cache(maxsize=4)
 def _nodes(resolution: int) -> _Nodes:
-    from scipy.sparse import csr_array
-
     grid = disc_grid(resolution)
     axis = np.linspace(-1.0, 1.0, VIEW_SIDE)
     p = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import Delaunay, QhullError
 
 # Points of the plane closer to a line or a hull than this part of the set's extent lie on it.
 _ON = 1e-9
@@ -45,8 +46,6 @@ def fresnel_roughness_mix(points: NDArray[np.float64], f0: float, roughness: flo
     other by the ratio of their widths, and roughnesses of real materials run over two decades. Outside of the hull the
     nearest point of it is taken, in that scale; a set on one line is interpolated along the line.
     """
-    from scipy.spatial import Delaunay, QhullError
-
     found = np.asarray(points, np.float64)
     same = np.flatnonzero((found[:, 0] == f0) & (found[:, 1] == roughness))
     if len(same):

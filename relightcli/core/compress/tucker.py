@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import eigh
 
 from relightcli.errors import NumericalError
 
@@ -137,8 +138,6 @@ def pair_safe_rank(spectrum: NDArray[np.float64], rank: int) -> int:
 def gram_spectrum(gram: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Eigenvalues (r,), falling, and eigenvectors (n, r) of a Gram matrix (n, n), by the sign rule; r >= 1 is the
     numerical rank. Of a zero matrix: the value 0 and the first unit vector."""
-    from scipy.linalg import eigh  # half a second that a picture of vertices need not wait for
-
     values, vectors = eigh(gram, driver="evd", check_finite=False)
     values, vectors = values[::-1], vectors[:, ::-1]
     if not values[0] > 0.0:

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from relightcli.core.brdf.separable import TERMS
 from relightcli.core.lights.environment import SkyCube
@@ -268,8 +269,6 @@ def _blend(site, weight, values, out):  # type: ignore[no-untyped-def]
 
 def between(points: NDArray[np.float64], sites: NDArray[np.float64]) -> Between:
     """Weights of sites (S, 3) at points (n, 3), S > 0."""
-    from scipy.spatial import cKDTree
-
     distance, site = cKDTree(sites).query(points, k=min(NEAREST, len(sites)))
     distance, site = distance.reshape(len(points), -1), site.reshape(len(points), -1)
     # Relative to the nearest; 0 / 0 at a site itself, which has all of the weight.
