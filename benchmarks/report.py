@@ -93,6 +93,35 @@ def markdown(document: dict[str, Any]) -> str:
     return "\n".join(lines).rstrip()
 
 
+BEGIN, END = "<!-- ratios: python -m benchmarks --document -->", "<!-- end of ratios -->"
+
+
+def ratios(document: dict[str, Any]) -> str:
+    """Every row of a JSON document of results that has a ratio or a target, as one Markdown table."""
+    machine = document["machine"]
+    rows = [
+        (name, *_cells(row))
+        for name, run in document["runs"].items()
+        if not run["quick"]
+        for row in run["report"]["rows"]
+        if row["ratio"] is not None or row["target"]
+    ]
+    where = f"{machine['cores']} cores, {machine['cpu']}, Python {machine['python']}"
+    return "\n".join([where, "", *_pipes(("benchmark", *HEAD), rows)])
+
+
+def put_ratios(page: str, document: dict[str, Any]) -> str:
+    """A page with the table of ratios between its two marks. Raises ValueError for a page without them."""
+    if page.count(BEGIN) != 1 or page.count(END) != 1 or page.index(BEGIN) > page.index(END):
+        raise ValueError(f"expected {BEGIN} and, after it, {END} once each")
+    return f"{page[: page.index(BEGIN)]}{BEGIN}\n{ratios(document)}\n{page[page.index(END) :]}"
+
+
+def aligned(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table as plain text."""
+    return "\n".join(_columns([head, *rows]))
+
+
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:
     ratio = "" if row["ratio"] is None else _number(row["ratio"])
     met = {None: "", True: "yes", False: "NO"}[row["met"]]

@@ -29,8 +29,7 @@ def local_path(path: str | os.PathLike[str]) -> Path:
     text = os.fspath(path)
     if "://" in text:
         raise StoreError(
-            f"{text}: stores are written to folders, which take their names by a rename; expected a path, found a URL. "
-            "Copy the finished store there: it can be read from a URL."
+            f"{text}: expected a path, found a URL; work goes into folders, and only finished stores to URLs."
         )
     return Path(os.path.realpath(text))
 

@@ -62,13 +62,18 @@ def _digest(document: dict[str, Any]) -> str:
 
 def write_root(folder: Path, header: dict[str, Any], attributes: dict[str, Any]) -> None:
     """Write the root document atomically and durably, with its digest."""
+    write_durably(folder / ROOT, root_bytes(header, attributes))
+
+
+def root_bytes(header: dict[str, Any], attributes: dict[str, Any]) -> bytes:
+    """The root document, with its digest."""
     document: dict[str, Any] = {
         "zarr_format": 3,
         "node_type": "group",
         "attributes": {**attributes, KEY: {key: value for key, value in header.items() if key != "digest"}},
     }
     document["attributes"][KEY]["digest"] = _digest(document)
-    write_durably(folder / ROOT, dump(document))
+    return dump(document)
 
 
 def load_document(file: Place, store: Place) -> tuple[dict[str, Any], bytes]:
@@ -96,7 +101,7 @@ def load_document(file: Place, store: Place) -> tuple[dict[str, Any], bytes]:
     return document, content
 
 
-def is_store(folder: Path) -> bool:
+def is_store(folder: Place) -> bool:
     """Whether the folder is a relight store of any version, whole or not: what `--overwrite` may replace."""
     try:
         document, _ = load_document(folder / ROOT, folder)

@@ -12,6 +12,8 @@ from relight_formats.fingerprint import plain
 from relight_formats.header import CONVENTIONS, FORMAT, ROOT, is_store, mismatch, read_root, write_root
 from relight_formats.lock import Lock
 from relight_formats.publish import discard, sealed, tidy
+from relight_formats.remote import RemotePath, place
+from relight_formats.upload import Target
 from relight_formats.writer import Status, Writer
 
 
@@ -27,7 +29,8 @@ def begin(
     """Start or continue the store at `path`.
 
     Args:
-        path: final name of the store; work goes into `<path>.partial`.
+        path: final name of the store; work goes into `<path>.partial`. At a URL: work goes into a folder of the current
+            directory, and is sent when it is finished (`upload`).
         kind: what the store holds (`transfer`, `clusters`, ...).
         settings: JSON values that decide the result.
         inputs: name to fingerprint of everything the result is made from.
@@ -43,10 +46,8 @@ def begin(
     Raises:
         StoreError: a store, finished or not, made from other inputs or settings, unless `overwrite`; a damaged one,
             unless `overwrite`; something that is no relight store (never touched); another writer at work.
-        OSError: the folder is missing or cannot be written.
+        OSError: the folder is missing or cannot be written; the URL cannot be reached.
     """
-    final = local_path(path)
-    partial = sibling(final, UNFINISHED)
     header = {
         "format": FORMAT,
         "kind": kind,
@@ -60,6 +61,39 @@ def begin(
         "ledger": None,
         "content": None,
     }
+    where = place(path)
+    if isinstance(where, RemotePath):
+        return _begin_at(where, header, overwrite)
+    return _begin_in(local_path(where), header, overwrite)
+
+
+def _begin_at(where: RemotePath, header: dict[str, Any], overwrite: bool) -> Writer | None:
+    target = Target(where, header, overwrite)
+    if target.finished:
+        return None
+    unsent = sealed(target.folder) and _same(target.folder, header)  # the last run could not send it
+    try:
+        writer = _begin_in(target.folder, header, overwrite and not unsent)
+    except StoreError as error:
+        raise StoreError(f"{where}: {error}") from None
+    if writer is None:
+        lock = Lock(target.folder)
+        try:
+            target.send()
+        finally:
+            lock.release()
+        return None
+    try:
+        target.claim(writer.header)
+    except BaseException:
+        writer.close()
+        raise
+    writer.target = target
+    return writer
+
+
+def _begin_in(final: Path, header: dict[str, Any], overwrite: bool) -> Writer | None:
+    partial = sibling(final, UNFINISHED)
     if not overwrite and _finished(final, header):
         _tidy_beside(final, partial, header)
         return None

@@ -18,6 +18,7 @@ from relight_formats.ledger import DOCUMENTS, FILE_NAME, LedgerFile, read_ledger
 from relight_formats.lock import Lock
 from relight_formats.publish import publish
 from relight_formats.seal import LEDGER_GROUP, seal
+from relight_formats.upload import Target
 
 if TYPE_CHECKING:
     import zarr
@@ -50,6 +51,8 @@ class Writer:
         self.partial_path = partial
         """Where it is while it is written."""
         self.status = status
+        self.target: Target | None = None
+        """The URL that the store goes to once it is finished, if there is one."""
         self._header = header
         self._attributes = attributes
         self._lock = lock
@@ -57,6 +60,11 @@ class Writer:
         self._layouts: dict[str, Layout] = check_unfinished(partial)
         self._ledger = LedgerFile(partial / FILE_NAME)
         self._documents = LedgerFile(partial / DOCUMENTS)
+
+    @property
+    def header(self) -> dict[str, Any]:
+        """Of the root metadata so far."""
+        return self._header
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -299,6 +307,8 @@ class Writer:
         self._ledger.close()
         self._documents.close()
         publish(self.path, self.partial_path)
+        if self.target is not None:
+            self.target.send()
         self.status = Status.DONE
         self._lock.release()
 

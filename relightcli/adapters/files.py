@@ -14,16 +14,36 @@ from typing import BinaryIO
 from relightcli.errors import InputError
 
 
-def need_output(path: str | Path) -> None:
-    """Refuse an output that cannot be made, before work goes into it. Raises InputError."""
+def need_output(path: str | Path, store: bool = False) -> None:
+    """Refuse an output that cannot be made, before work goes into it. Raises InputError.
+
+    store: a store is to be made, for which a URL will do.
+    """
     if "://" in str(path):
-        raise InputError(f"--output {path}: expected a path; what is finished can be copied to a URL, and read there")
+        if not store:
+            raise InputError(f"--output {path}: expected a path; only stores are written to a URL")
+        _need_scheme(str(path))
+        return
     target = Path(os.path.realpath(path))
     if not str(path) or not target.name:
         raise InputError(f"--output {str(path)!r}: expected the name of a file or store to write")
     if not target.parent.is_dir():
         found = "is a file" if target.parent.exists() else "does not exist; create it first"
         raise InputError(f"--output {path}: expected a folder to write into, but {target.parent} {found}")
+
+
+def _need_scheme(url: str) -> None:
+    try:
+        from fsspec import get_filesystem_class
+        from fsspec.utils import get_protocol
+    except ImportError:
+        raise InputError(
+            f"--output {url}: stores at a URL need fsspec, which is not installed: pip install 'relightcli[cluster]'"
+        ) from None
+    try:
+        get_filesystem_class(get_protocol(url))
+    except (ImportError, ValueError) as error:
+        raise InputError(f"--output {url}: expected a path, or a URL that fsspec can open; {error}") from None
 
 
 def write_atomic(path: str | Path, data: bytes) -> None:

@@ -74,7 +74,8 @@ def load_mesh(path: Path) -> LoadedMesh:
     Raises InputError, naming the file, for whatever cannot be loaded as triangles with finite coordinates.
     """
     data, suffix = read_file(path)
-    _import_trimesh()
+    if suffix not in (".gltf", ".glb"):
+        _import_trimesh()
     notes: list[str] = []
     try:
         # Infinities that arise here are found and refused by `finish_mesh`.

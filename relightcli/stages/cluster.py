@@ -56,7 +56,7 @@ def cluster(config: Config) -> dict[str, Any]:
     started, account = time.perf_counter(), Account()
     if not 0.0 < config.tolerance < 1.0:
         raise InputError(f"--tolerance: expected more than 0 and less than 1; found {config.tolerance}")
-    need_output(config.output)
+    need_output(config.output, store=True)
     with account.step("reading"):
         lighting = LightingStore(config.store, config.workers)
     need_still(lighting.store)

@@ -57,7 +57,7 @@ def factorize(config: Config) -> dict[str, Any]:
     for name, value in (("--eigenvectors", config.eigenvectors), ("--light-rank", config.light_rank)):
         if value < 1:
             raise InputError(f"{name}: expected at least 1; found {value}")
-    need_output(config.output)
+    need_output(config.output, store=True)
     with account.step("reading"):
         lighting = LightingStore(config.store, config.workers)
     store = lighting.store

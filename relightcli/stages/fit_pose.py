@@ -62,7 +62,7 @@ def fit_pose(config: Config) -> dict[str, Any]:
     """Runs the stage; returns a summary. Raises InputError, StoreError, NumericalError, OSError."""
     started, account = time.perf_counter(), Account()
     _check(config)
-    need_output(config.output)
+    need_output(config.output, store=True)
     store = formats.open_store(config.store)
     if store.kind != "transfer":
         raise StoreError(f"{config.store}: expected a store of kind transfer, found {store.kind}.")

@@ -74,7 +74,7 @@ def cluster_lights(config: Config) -> dict[str, Any]:
     """Runs the stage; returns a summary. Raises InputError, StoreError, OSError."""
     started, account = time.perf_counter(), Account()
     epsilon = _check(config)
-    need_output(config.output)
+    need_output(config.output, store=True)
     run.need_scheduler(None if config.dry_run else config.scheduler)
     with account.step("reading"):
         lighting = LightingStore(config.store, config.workers)

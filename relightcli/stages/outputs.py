@@ -64,7 +64,7 @@ def output_suffix(output: str) -> str:
     suffix = Path(output).suffix.lower()
     if suffix not in SUFFIXES:
         raise InputError(f"--output {output}: expected a name ending in {', '.join(SUFFIXES)}, or - for stdout")
-    need_output(output)
+    need_output(output, store=suffix == ".zarr")
     return suffix
 
 

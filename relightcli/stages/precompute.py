@@ -30,7 +30,7 @@ WRONG_BITS = 1e-3  # share of wrong bits above which the user is told
 def precompute(config: Config) -> dict[str, Any]:
     """Runs the stage; returns a summary for the user. Raises the errors of `relightcli.errors` and OSError."""
     started, account = time.perf_counter(), Account()
-    need_output(config.output)
+    need_output(config.output, store=True)
     run.need_scheduler(None if config.dry_run else config.scheduler)
     prepared = prepare(config, account)
     if config.dry_run:

@@ -42,5 +42,28 @@ def test_relight_and_diff(here, remote, capsys):
 def test_what_is_not_there_and_what_cannot_be_written(here, remote, refused):
     refused(["relight", "memory://bucket/other.zarr", "--env", "sky", "-o", "x.exr"], "found nothing", code=3)
     refused(["inspect", "nothing://x/t.zarr"], "nothing://x/t.zarr", code=3)
-    refused(["precompute", "scene.toml", "-o", "memory://bucket/new.zarr"], "can be copied to a URL")
-    refused(["relight", "t.zarr", "--env", "sky", "-o", "memory://bucket/new.zarr"], "can be copied to a URL")
+    refused(["precompute", "scene.toml", "-o", "nothing://x/new.zarr"], "nothing")
+    refused(["relight", "t.zarr", "--env", "sky", "-o", "memory://bucket/new.exr"], "only stores are written to a URL")
+    refused(["tradeoff", "scene.toml", "-o", "memory://bucket/report"], "only stores are written to a URL")
+
+
+def test_stores_are_made_at_a_url(here, remote, capsys):
+    made = "memory://bucket/made.zarr"
+    command = ["precompute", "scene.toml", "--light-resolution", "16", "--no-subdivide", "--bounces", "0", "-o"]
+    assert run([*command, made, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["store"], told["status"]) == (made, "written")
+    assert run(["diff", "t.zarr", made]) == 0
+    capsys.readouterr()
+    assert run([*command, made, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["status"] == "up to date"
+    assert run([*command, made, "--light-resolution", "32", "-q"]) == 3
+    assert (
+        run(["cluster", made, "-o", "memory://bucket/c.zarr", "--light-resolution", "16", "--lights", "24", "-q"]) == 0
+    )
+    assert run(["inspect", "memory://bucket/c.zarr", "--verify", "-q"]) == 0
+    assert run(["relight", made, "--env", "sky", "-o", "memory://bucket/radiance.zarr", "-q"]) == 0
+    assert run(["relight", made, "--env", "sky", "-o", "radiance.zarr", "-q"]) == 0
+    assert run(["diff", "radiance.zarr", "memory://bucket/radiance.zarr"]) == 0
+    assert not list(here.glob("*.partial"))
+    assert not list(here.glob("made*"))

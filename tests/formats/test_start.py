@@ -282,11 +282,6 @@ def test_a_missing_folder_is_a_system_error_that_names_it(tmp_path: Path) -> Non
     assert error.value.filename == str(tmp_path / "nowhere")
 
 
-def test_urls_are_refused() -> None:
-    with pytest.raises(StoreError, match="found a URL"):
-        begin("s3://bucket/store.zarr", "test", settings={}, inputs={}, program="test 1")
-
-
 def test_a_symbolic_link_to_a_store_is_followed(tmp_path: Path) -> None:
     (tmp_path / "disk").mkdir()
     link = tmp_path / "link.zarr"

@@ -122,9 +122,11 @@ def _trace_batch(
 ) -> tuple[int, int, int, int]:
     n, cells = len(origins), len(tables.first_texel)
     normals = np.ascontiguousarray(normals, np.float32)
+    state = np.zeros((n, cells), np.uint8)
+    probed = np.full((n, cells), -1, np.int32)
     if refine == 1:
         mark = np.ones((n, cells), np.uint8)
-        traced = _trace_cells(tracer, origins, normals, tables, resolution, refine, mark, words, room)
+        traced = _trace_cells(tracer, origins, normals, tables, resolution, refine, mark, state, probed, words, room)
         return traced, 0, 0, 0
 
     # One probe per cell.
@@ -140,9 +142,9 @@ def _trace_batch(
         room.origins,
         room.directions,
         room.target,
+        probed,
     )
     blocked = tracer.occluded(room.origins[:rays], room.directions[:rays])
-    state = np.zeros((n, cells), np.uint8)
     _store_probes(room.target, blocked, state)
 
     # Cells that disagree with a neighbour, here or at a receiver of the group, are traced; the others are filled.
@@ -159,7 +161,7 @@ def _trace_batch(
         mark,
         words,
     )
-    rays += _trace_cells(tracer, origins, normals, tables, resolution, refine, mark, words, room)
+    rays += _trace_cells(tracer, origins, normals, tables, resolution, refine, mark, state, probed, words, room)
 
     # A random sample of what was filled.
     ray_origins, ray_directions, owner, texel = _checks(
@@ -170,7 +172,7 @@ def _trace_batch(
     again = np.zeros_like(mark)
     wrong = _compare(owner, texel, blocked, words, resolution, refine, tables.neighbours, mark, again)
     if wrong:
-        rays += _trace_cells(tracer, origins, normals, tables, resolution, refine, again, words, room)
+        rays += _trace_cells(tracer, origins, normals, tables, resolution, refine, again, state, probed, words, room)
     return rays, len(owner), wrong, inferred
 
 
@@ -182,10 +184,13 @@ def _trace_cells(
     resolution: int,
     refine: int,
     mark: NDArray[np.uint8],
+    state: NDArray[np.uint8],
+    probed: NDArray[np.int32],
     words: NDArray[np.uint64],
     room: _Rays,
 ) -> int:
-    """Traces every texel above the horizon of the marked cells and writes its bit; returns the number of rays."""
+    """Traces every texel above the horizon of the marked cells but the probed one, whose `state` is known, and writes
+    their bits; returns the number of rays."""
     count = _cell_rays(
         origins,
         normals,
@@ -196,6 +201,9 @@ def _trace_cells(
         resolution,
         refine,
         mark,
+        state,
+        probed,
+        words,
         room.origins,
         room.directions,
         room.target,
@@ -224,8 +232,9 @@ def _set_horizon(normals, directions, words):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _probes(origins, normals, directions, first, centers, reach, resolution, refine, out_o, out_d, owner):  # type: ignore[no-untyped-def]
-    """One ray for each cell that is not below the horizon; `owner` is its cell among those of all receivers."""
+def _probes(origins, normals, directions, first, centers, reach, resolution, refine, out_o, out_d, owner, probed):  # type: ignore[no-untyped-def]
+    """One ray for each cell that is not below the horizon; `owner` is its cell among those of all receivers, `probed`
+    its texel."""
     n, cells = len(origins), len(first)
     count = 0
     area = refine * refine
@@ -256,6 +265,7 @@ def _probes(origins, normals, directions, first, centers, reach, resolution, ref
                 out_d[count, 1] = directions[found, 1]
                 out_d[count, 2] = directions[found, 2]
                 owner[count] = i * cells + c
+                probed[i, c] = found
                 count += 1
     return count
 
@@ -322,8 +332,27 @@ def _fill(normals, directions, first, centers, reach, resolution, refine, state,
 
 
 @njit(cache=True)
-def _cell_rays(origins, normals, directions, first, centers, reach, resolution, refine, mark, out_o, out_d, target):  # type: ignore[no-untyped-def]
-    """Rays of all texels above the horizon of the marked cells; `target` is their bit in the words of all receivers."""
+def _cell_rays(  # type: ignore[no-untyped-def]
+    origins,
+    normals,
+    directions,
+    first,
+    centers,
+    reach,
+    resolution,
+    refine,
+    mark,
+    state,
+    probed,
+    words,
+    out_o,
+    out_d,
+    target,
+):
+    """Rays of all texels above the horizon of the marked cells; `target` is their bit in the words of all receivers.
+
+    A probed texel needs no second ray: its bit is set here.
+    """
     n, cells = mark.shape
     texels = len(directions)
     count = 0
@@ -336,9 +365,14 @@ def _cell_rays(origins, normals, directions, first, centers, reach, resolution, 
             if height < -reach[c]:
                 continue
             whole = height > reach[c]
+            known = probed[i, c]
+            if state[i, c] == OPEN:
+                words[i, known >> 6] |= np.uint64(1) << np.uint64(known & 63)
             for a in range(refine):
                 row = first[c] + a * resolution
                 for t in range(row, row + refine):
+                    if t == known:
+                        continue
                     if whole or _above(normals, directions, i, t):
                         out_o[count, 0] = x
                         out_o[count, 1] = y

@@ -77,6 +77,29 @@ def test_every_texel_against_its_ray(traced):
     assert block.rays == count(horizon_bits(normals, 32))
 
 
+@pytest.mark.parametrize("refine", [1, 2, 4])
+def test_no_ray_is_cast_twice(refine):
+    positions, faces, points, normals = still_life()
+    # The sphere's grid has several points at its seam, whose rays are the same.
+    once = np.sort(np.unique(np.concatenate([points, normals], axis=1), axis=0, return_index=True)[1])
+    points, normals = points[once][:96], normals[once][:96]
+    tracer, rays = Tracer(positions, faces), []
+
+    class Recorder:
+        offset = staticmethod(tracer.offset)
+
+        def occluded(self, origins, directions, max_distance=None):
+            rays.append(np.concatenate([origins, directions], axis=1))
+            return tracer.occluded(origins, directions, max_distance)
+
+    block = trace_visibility(Recorder(), points, normals, 32, refine, 0)
+    cast = np.concatenate(rays)
+    assert len(cast) == block.rays
+    different = len(np.unique(np.ascontiguousarray(cast).view("V24")))
+    # Checks are drawn at random: from probes too, and some twice; one that is wrong is followed by its whole cell.
+    assert len(cast) - different <= block.checked
+
+
 @pytest.mark.parametrize("resolution", [16, 24, 40, 64])
 def test_horizon_bits(resolution):
     normals = random_directions(20, 1).astype(np.float32)
