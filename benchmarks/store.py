@@ -53,7 +53,7 @@ def write_raw(path: Path, bits: NDArray[np.uint8]) -> None:
 
 
 def codecs() -> dict[str, Any]:
-    """What is tried; the format has lz4 (blosc, level 5, byte shuffle) and zstd (level 3)."""
+    """What is tried; the format has lz4 (blosc, level 5), zstd (level 3) and zstd in blosc, bytes shuffled."""
     from numcodecs import Blosc, Zstd
 
     return {

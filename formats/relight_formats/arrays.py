@@ -13,7 +13,8 @@ from typing import Any, Literal, TypeGuard
 from relight_formats.errors import AGAIN, StoreError
 from relight_formats.fingerprint import plain
 
-Codec = Literal["lz4", "zstd", "none"]
+Codec = Literal["lz4", "zstd", "zstd_shuffled", "none"]
+CODECS: tuple[Codec, ...] = ("lz4", "zstd", "zstd_shuffled", "none")
 
 ITEM_BYTES = {
     "bool": 1,
@@ -39,6 +40,7 @@ CHUNK_LIMIT = 1 << 30
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*")
 _LZ4 = {"cname": "lz4", "clevel": 5, "shuffle": "shuffle", "blocksize": 0}
+_ZSTD_SHUFFLED = {"cname": "zstd", "clevel": 3, "shuffle": "shuffle", "blocksize": 0}
 _ZSTD = {"name": "zstd", "configuration": {"level": 3, "checksum": False}}
 _KEYS = {
     "zarr_format",
@@ -65,7 +67,7 @@ def check_name(name: str) -> None:
 
 @dataclass(frozen=True)
 class Layout:
-    """Shape, chunking and packing (`lz4`, `zstd`, `none`) of one array, taken from its checked metadata."""
+    """Shape, chunking and packing (one of CODECS) of one array, taken from its checked metadata."""
 
     shape: tuple[int, ...]
     chunks: tuple[int, ...]
@@ -164,6 +166,7 @@ def _codecs(dtype: str, codec: str) -> list[dict[str, Any]]:
         "none": [],
         "lz4": [{"name": "blosc", "configuration": {"typesize": size, **_LZ4}}],
         "zstd": [_ZSTD],
+        "zstd_shuffled": [{"name": "blosc", "configuration": {"typesize": size, **_ZSTD_SHUFFLED}}],
     }
     if codec not in packing:
         raise ValueError(f"codec {codec!r}: expected one of {', '.join(packing)}.")
@@ -199,8 +202,12 @@ def read_layout(document: dict[str, Any], where: str) -> Layout:
     )
     encoding = {"name": "default", "configuration": {"separator": "."}}
     need(document.get("chunk_key_encoding") == encoding, "chunk_key_encoding", "'default' with separator '.'")
-    allowed = {codec: _codecs(dtype, codec) for codec in ("lz4", "zstd", "none")}
-    need(document.get("codecs") in allowed.values(), "codecs", "bytes, then nothing, blosc lz4 or zstd, then crc32c")
+    allowed = {codec: _codecs(dtype, codec) for codec in CODECS}
+    need(
+        document.get("codecs") in allowed.values(),
+        "codecs",
+        "bytes, then nothing, zstd or blosc (lz4, zstd), then crc32c",
+    )
     need(_fills(document.get("fill_value"), dtype), "fill_value", f"a value of {dtype}")
     need(document.get("storage_transformers", []) == [], "storage_transformers", "none")
     attributes = document.get("attributes")

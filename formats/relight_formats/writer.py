@@ -120,7 +120,8 @@ class Writer:
             dims: one name per axis; within a group and those above and below it a name stands for one size.
             units: SI symbol (`m`, `sr`, `s`); None is written as `1`, a plain number.
             attrs: further JSON attributes.
-            codec: `lz4` (blosc, byte shuffle), `zstd` (level 3) or `none`; a CRC-32C always follows.
+            codec: `lz4` (blosc, byte shuffle), `zstd` (level 3), `zstd_shuffled` (blosc, byte shuffle, level 3) or
+                `none`; a CRC-32C always follows.
             fill: the value that unwritten elements of a chunk read as.
 
         Raises:

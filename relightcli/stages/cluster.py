@@ -162,6 +162,7 @@ def copy_arrays(store: formats.Store, writer: formats.Writer, names: list[str]) 
     for name in names:
         source: Any = store.array(name)
         layout = store.layouts[name]
+        codec: Any = layout.codec
         attributes = dict(source.attrs)
         units = attributes.pop("units")
         target: Any = writer.array(
@@ -172,7 +173,7 @@ def copy_arrays(store: formats.Store, writer: formats.Writer, names: list[str]) 
             dims=layout.dims,
             units=None if units == "1" else units,
             attrs=attributes,
-            codec="zstd" if any(c["name"] == "zstd" for c in source.metadata.to_dict()["codecs"]) else "lz4",
+            codec=codec,
         )
         if f"copy/{name}" in writer.done:
             continue

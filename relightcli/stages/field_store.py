@@ -17,7 +17,7 @@ Whole numbers of more than 8 bits lie as two planes of bytes, the low ones q - 2
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -89,7 +89,7 @@ def read_transfer(store: formats.Store, prefix: str) -> CompressedTransfer:
     )
     coefficient = np.empty_like(sorted_)
     coefficient[_by_component(made)] = sorted_
-    return CompressedTransfer(**{**made.__dict__, "coefficient": coefficient})
+    return replace(made, coefficient=coefficient)
 
 
 def _by_component(made: CompressedTransfer) -> NDArray[np.int64]:

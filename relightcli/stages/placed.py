@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 import relight_formats as formats
 from relightcli.adapters.rays import Tracer
-from relightcli.core.brdf.models import SPECULAR, pack_materials
-from relightcli.core.fields.albedos import self_weights, transfer_at
+from relightcli.core.brdf.models import MODEL_CODES, SPECULAR, pack_materials
+from relightcli.core.fields.albedos import Scaled, reflectance, self_weights, transfer_at
 from relightcli.core.fields.body import Body, axes
 from relightcli.core.fields.entities import Entity, Surroundings, of_light
 from relightcli.core.fields.interpolate import make_grid
 from relightcli.core.fields.shade import Receivers
 from relightcli.core.fields.standing import Between, between
+from relightcli.core.shade.low_order import response
 from relightcli.core.sphere.rotation import rotation_matrices
 from relightcli.errors import InputError
 from relightcli.scene.model import Material, RectangleLight, SphereLight
@@ -34,14 +35,19 @@ SIMILAR = 1e-6  # relative, by which a placement may differ from a rotation and 
 @dataclass(frozen=True)
 class Mover:
     """One object that may be moved. rows: its receivers; placement (4, 4): from its field's frame to where the scene
-    has it; kept: the field, if it holds for any albedo; made_for: the material of `own` and `receivers`; sites (S, 3)
-    on it in the field's frame, after its proxies; spread: how its points take light from those."""
+    has it; kept: the field, if the material may be changed; any_albedo: whether it holds for all of them; stored: the
+    material that it was simulated with, texture (3,) the mean of what is multiplied to its diffuse colour; made_for:
+    that of `body`, `own`, `receivers` and `colour`; sites (S, 3) on it in the field's frame, after its proxies; spread:
+    how its points take light from those."""
 
     name: str
     rows: slice
     placement: F64
     material: str
     kept: KeptField | None
+    any_albedo: bool
+    stored: Material
+    texture: F64
     made_for: Material
     body: Body
     own: Surroundings
@@ -56,18 +62,40 @@ class Mover:
         return 0 if self.own.proxies is None else len(self.own.proxies)
 
     def dyed(self, material: Material) -> Mover:
-        """With another diffuse colour. Raises InputError for what its field does not hold for."""
+        """With another material. Raises InputError for what its field does not hold for."""
         if material == self.made_for:
             return self
+        if self.kept is not None and not self.any_albedo:
+            return self._coated(self.kept, material)
         if self.kept is None or replace(material, diffuse=self.made_for.diffuse) != self.made_for:
             raise InputError(
                 f"--set {self.material}: is the material of {self.name!r}, which moves: of its fields, only the "
-                "diffuse colour of an adjustable lambert material without a coloured texture can be changed. Change "
-                "the scene file and precompute again, or add --reference."
+                "diffuse colour of an adjustable lambert material without a coloured texture, and adjustable materials "
+                "with a specular lobe, can be changed. Change the scene file and precompute again, or add --reference."
             )
         own = replace(self.own, transfer=transfer_at(self.kept.transfer, material.diffuse))
         receivers = _receivers(self.body, self.kept, material, any_albedo=True)
         return replace(self, made_for=material, own=own, receivers=receivers)
+
+    def _coated(self, kept: KeptField, material: Material) -> Mover:
+        """With another material in the place of one with a specular lobe."""
+        row = pack_materials([material]).parameters[0]
+        lobe = self.body.lobe  # of a material without one: in no colour
+        if any(material.specular):
+            lobe = response(MODEL_CODES[material.model], row, self.body.order)
+        was = pack_materials([self.stored])
+        before = response(int(was.model[0]), was.parameters[0], self.body.order)
+        rho = reflectance(self.texture * material.diffuse, row[SPECULAR : SPECULAR + 3], lobe)
+        rho_before = reflectance(self.texture * self.stored.diffuse, was.parameters[0, SPECULAR : SPECULAR + 3], before)
+        factor = np.divide(rho, rho_before, out=np.zeros(3), where=rho_before > 0.0)
+        return replace(
+            self,
+            made_for=material,
+            body=self.body._replace(lobe=lobe),
+            own=replace(self.own, transfer=Scaled(kept.transfer, factor.astype(np.float32))),
+            receivers=self.receivers._replace(to_diffuse=kept.self_diffuse * np.array(material.diffuse, np.float32)),
+            colour=row[SPECULAR : SPECULAR + 3].astype(np.float32),
+        )
 
     def at(self, matrix: F64) -> Entity:
         """The object placed by (4, 4), a rotation times a positive number and a translation."""
@@ -109,7 +137,8 @@ def _read_object(
     prefix = f"fields/{key[0]}/"
     read: Any = store.read
     position, face = read(f"{prefix}mesh/position"), read(f"{prefix}mesh/face")
-    body = body_of(position, read(f"{prefix}mesh/normal"), face, key[2], read(f"{prefix}mesh/texture"), material, order)
+    texture = read(f"{prefix}mesh/texture")
+    body = body_of(position, read(f"{prefix}mesh/normal"), face, key[2], texture, material, order)
     kept, any_albedo = read_field(store, prefix), key[3]
     used = position[np.unique(face)]
     own = Surroundings(
@@ -126,8 +155,12 @@ def _read_object(
     chosen = np.unique(np.linspace(0, len(body.point) - 1, SITES).astype(int))
     on_surface = body.point[chosen]
     sites = np.concatenate([kept.proxies, on_surface + INWARDS * (body.center - on_surface)])
+    coated = material.adjustable and body.terms > 1
     return (
-        kept if any_albedo else None,
+        kept if any_albedo or coated else None,
+        any_albedo,
+        material,
+        np.asarray(texture, np.float64)[body.vertex].mean(axis=0),
         material,
         body,
         own,

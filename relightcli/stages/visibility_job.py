@@ -272,7 +272,7 @@ def create_outputs(writer: formats.Writer, job: VisibilityJob, count: int, size:
             chunks=(size, 6, c, c),
             dims=("receiver", "cube_face", "cell_row", "cell_column"),
             attrs={"description": "1 + the receiver seen through the blocked part of the cell; 0: nothing that shines"},
-            codec="zstd",
+            codec="zstd_shuffled",
         )
     if job.basis == "sh":
         n = job.sh_order**2

@@ -17,7 +17,7 @@ from relight_formats.header import DOCUMENT_LIMIT
 BOMB = 1 << 28  # bytes: what the chunk unpacks to; it is declared as 8 kB
 
 
-@pytest.fixture(params=["lz4", "zstd"])
+@pytest.fixture(params=["lz4", "zstd", "zstd_shuffled"])
 def store(tmp_path, request):
     with begin(tmp_path / "s.zarr", "samples", settings={}, inputs={}, program="p") as writer:
         writer.put("values", np.arange(1024.0), dims=("a",), codec=request.param)

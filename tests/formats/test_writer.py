@@ -28,7 +28,7 @@ def new(path: Path) -> Writer:
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.data(), st.sampled_from(TYPES), st.sampled_from(["lz4", "zstd", "none"]))
+@given(st.data(), st.sampled_from(TYPES), st.sampled_from(["lz4", "zstd", "zstd_shuffled", "none"]))
 def test_any_array_comes_back_bit_for_bit(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, dtype: str, codec: Any
 ) -> None:

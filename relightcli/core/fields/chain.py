@@ -15,19 +15,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from relightcli.core.fields.entities import Entity, Lookup, look_up
+from relightcli.core.fields.entities import Entity, Lookup, look_up, turn_together
 from relightcli.core.fields.standing import Between
 from relightcli.core.parts import in_parts
 from relightcli.core.sphere.triple_product import coefficients
 from relightcli.core.sphere.window import window
 
 EVEN = math.sqrt(4.0 * math.pi)  # coefficient of y_0 of the function 1
-LANES = 64
+LANES = 128
+STEP = LANES + 16  # from one coefficient's lanes to the next: powers of two would share few places of the cache
 
 
 def open_rows(
@@ -41,6 +44,7 @@ def open_rows(
     n = order * order
     rows = np.zeros((len(lookup.sample), 4, n), np.float32)
     rows[:, 0, 0] = EVEN
+    turn_together(entities, order)
 
     def put(e: int) -> None:
         own, part = entities[e].own, lookup.part(e)
@@ -92,11 +96,19 @@ def _times_each(values: NDArray[np.float32], matrix: NDArray[np.float32]) -> NDA
 @njit(cache=True, nogil=True, fastmath={"contract"})
 def _times(values, matrix):  # type: ignore[no-untyped-def]
     """values (k, N) times matrix (N, N): a library's threads would stand in the way of ours."""
+    n = values.shape[1]
     out = np.zeros(values.shape, np.float32)
-    for r in range(values.shape[0]):
-        for i in range(values.shape[1]):
-            for j in range(values.shape[1]):
-                out[r, j] += values[r, i] * matrix[i, j]
+    for r in range(len(values)):
+        own, sums = values[r], out[r]
+        for i in range(0, n - n % 4, 4):
+            p, q, v, w = own[i], own[i + 1], own[i + 2], own[i + 3]
+            a, b, c, d = matrix[i], matrix[i + 1], matrix[i + 2], matrix[i + 3]
+            for j in range(n):
+                sums[j] += p * a[j] + q * b[j] + v * c[j] + w * d[j]
+        for i in range(n - n % 4, n):
+            p, a = own[i], matrix[i]
+            for j in range(n):
+                sums[j] += p * a[j]
     return out
 
 
@@ -145,10 +157,7 @@ def light_at(
     count, n = len(lookup.place), rows.shape[2]
     behind = np.ascontiguousarray(far, np.float32).reshape(-1, 3, n)
     out = np.empty((count, 3, n), np.float32)
-    table = coefficients(math.isqrt(n))
-    # Unsigned: no place counts from the end, which costs a test.
-    factors = table.i.astype(np.uint64), table.j.astype(np.uint64), table.value.astype(np.float32)
-    terms = np.searchsorted(table.k, np.arange(n + 1))
+    terms = _terms(math.isqrt(n))
     flat = rows.reshape(len(rows), 4 * n)
     part_of = np.ones((1, lookup.place.shape[1]), np.float32) if share is None else share
     site, mix = (np.zeros((1, 1), np.int64), np.ones((1, 1), np.float32)) if spread is None else spread
@@ -161,7 +170,7 @@ def light_at(
         look = lookup.place[p:q], lookup.weight[p:q], lookup.nearest[p:q]
         shares = part_of if share is None else part_of[p:q]
         sites = (site, mix) if spread is None else (site[p:q], mix[p:q])
-        _chain(*look, shares, flat, own, spread is not None, *sites, merged, single, terms, *factors, out[p:q])
+        _chain(*look, shares, flat, own, spread is not None, *sites, merged, single, *terms, out[p:q])
 
     # Whole groups of lanes: a few points fill no lanes when they are split.
     groups = -(-count // LANES)
@@ -180,16 +189,37 @@ def passing(lookup: Lookup, rows: NDArray[np.float32], threads: int = 1, merged:
     return light_at(lookup, dark, even, threads, merged=merged)[:, 0]
 
 
+class _Terms(NamedTuple):
+    """The coefficients of products, k slowest: those of k, filled up to a multiple of four, are start[k] to
+    start[k + 1]; i, j: where the factors' lanes begin."""
+
+    start: NDArray[np.int64]
+    i: NDArray[np.int64]
+    j: NDArray[np.int64]
+    value: NDArray[np.float32]
+
+
+@lru_cache(maxsize=8)
+def _terms(order: int) -> _Terms:
+    table = coefficients(order)
+    count = np.bincount(table.k, minlength=order**2)
+    start = np.concatenate([[0], np.cumsum(-(-count // 4) * 4)]).astype(np.int64)
+    place = np.arange(len(table.k)) + (start[:-1] - (np.cumsum(count) - count))[table.k]
+    i, j, value = np.zeros(start[-1], np.int64), np.zeros(start[-1], np.int64), np.zeros(start[-1], np.float32)
+    i[place], j[place], value[place] = STEP * table.i, 3 * STEP * table.j, table.value
+    return _Terms(start, i, j, value)
+
+
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _chain(  # type: ignore[no-untyped-def]
-    place, weight, nearest, share, rows, far, mixed, site, mix, merged, alone, terms, ti, tj, value, out
+    place, weight, nearest, share, rows, far, mixed, site, mix, merged, alone, start, ti, tj, value, out
 ):
     """LANES points at a time, one beside the other in memory, so that every step is one of vectors. Every point has as
     many steps as it needs: a group of entities each, from far to near."""
     n = out.shape[2]
-    light, new = np.zeros((3, n, LANES), np.float32), np.empty((3, n, LANES), np.float32)
-    row, seen = np.empty(4 * n, np.float32), np.zeros((4 * n, LANES), np.float32)
-    total = np.empty((3, LANES), np.float32)
+    # Coefficient k of colour c begins at STEP (3 k + c).
+    light, new = np.zeros(3 * n * STEP, np.float32), np.zeros(3 * n * STEP, np.float32)
+    row, passes = np.empty(4 * n, np.float32), np.zeros(n * STEP, np.float32)
     left = np.empty(LANES, np.int64)  # the furthest entity that is still to come
     one, even, zero = np.float32(1.0), np.float32(EVEN), np.float32(0.0)
     for first in range(0, len(place), LANES):
@@ -198,9 +228,7 @@ def _chain(  # type: ignore[no-untyped-def]
             at = first + lane
             left[lane] = nearest.shape[1] - 1
             if mixed:
-                for c in range(3):
-                    for k in range(n):
-                        row[c * n + k] = zero
+                row[:] = zero
                 for s in range(site.shape[1]):
                     w, own = mix[at, s], far[site[at, s]]
                     for c in range(3):
@@ -208,12 +236,12 @@ def _chain(  # type: ignore[no-untyped-def]
                             row[c * n + k] += w * own[c, k]
                 for c in range(3):
                     for k in range(n):
-                        light[c, k, lane] = row[c * n + k]
+                        light[(3 * k + c) * STEP + lane] = row[c * n + k]
             else:
                 own = far[0] if len(far) == 1 else far[at]
                 for c in range(3):
                     for k in range(n):
-                        light[c, k, lane] = own[c, k]
+                        light[(3 * k + c) * STEP + lane] = own[c, k]
         going = lanes
         while going > 0:
             going = 0
@@ -221,54 +249,85 @@ def _chain(  # type: ignore[no-untyped-def]
                 if left[lane] < -1:  # done: its light has been written
                     continue
                 at = first + lane
-                for k in range(4 * n):
-                    row[k] = zero
+                row[:] = zero
                 rest, hidden, taken, single = one, zero, False, False
                 while left[lane] >= 0:
                     e = nearest[at, left[lane]]
                     if e >= 0:
                         part = share[0, e] if len(share) == 1 else share[at, e]
-                        own_hidden, used = zero, False
+                        w, p = weight[at, e], place[at, e]
+                        total, own_hidden = zero, zero
                         for s in range(8):
-                            w = weight[at, e, s]
-                            if w > zero:
-                                used = True
-                                own_hidden += w * part * (one - rows[np.uint64(place[at, e, s]), 0] / even)
-                        if used:
-                            if taken and (single or alone[e] or hidden + own_hidden > merged):
+                            total += w[s]
+                        if total > zero:
+                            if merged > 0.0:
+                                for s in range(8):
+                                    own_hidden += w[s] * part * (one - rows[p[s], 0] * (one / even))
+                            if taken and (single or alone[e] or merged <= 0.0 or hidden + own_hidden > merged):
                                 break
                             taken, single = True, alone[e]
                             hidden += own_hidden
-                            for s in range(8):
-                                w = weight[at, e, s] * part
-                                if w > zero:
-                                    rest -= w
-                                    sample = np.uint64(place[at, e, s])
-                                    for k in range(4 * n):
-                                        row[k] += w * rows[sample, k]
+                            rest -= total * part
+                            _add_samples(rows, p, w, part, row)
                     left[lane] -= 1
                 if not taken:
                     for c in range(3):
                         for k in range(n):
-                            out[at, c, k] = light[c, k, lane]
+                            out[at, c, k] = light[(3 * k + c) * STEP + lane]
                     left[lane] = -2
+                    for k in range(n):
+                        passes[k * STEP + lane] = zero
                     continue
                 going += 1
                 row[0] += rest * even
-                for k in range(4 * n):
-                    seen[k, lane] = row[k]
+                for k in range(n):
+                    passes[k * STEP + lane] = row[k]
+                    for c in range(3):
+                        new[(3 * k + c) * STEP + lane] = row[(c + 1) * n + k]
             if going == 0:
                 break
-            for k in range(n):
-                total[:] = zero
-                for t in range(terms[k], terms[k + 1]):
-                    i, j, v = ti[t], tj[t], value[t]
-                    for lane in range(LANES):
-                        p = v * seen[i, lane]
-                        total[0, lane] += p * light[0, j, lane]
-                        total[1, lane] += p * light[1, j, lane]
-                        total[2, lane] += p * light[2, j, lane]
-                for c in range(3):
-                    for lane in range(LANES):
-                        new[c, k, lane] = seen[(c + 1) * n + k, lane] + total[c, lane]
+            _add_products(passes, light, new, start, ti, tj, value)
             light, new = new, light
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _add_samples(rows, place, weight, part, row):  # type: ignore[no-untyped-def]
+    """Adds weight times part of the eight samples to row; those without weight have any place."""
+    a, b, c, d = rows[place[0]], rows[place[1]], rows[place[2]], rows[place[3]]
+    e, f, g, h = rows[place[4]], rows[place[5]], rows[place[6]], rows[place[7]]
+    wa, wb, wc, wd = weight[0] * part, weight[1] * part, weight[2] * part, weight[3] * part
+    we, wf, wg, wh = weight[4] * part, weight[5] * part, weight[6] * part, weight[7] * part
+    for k in range(len(row)):
+        near = wa * a[k] + wb * b[k] + wc * c[k] + wd * d[k]
+        row[k] += near + (we * e[k] + wf * f[k] + wg * g[k] + wh * h[k])
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _add_products(passes, light, new, start, ti, tj, value):  # type: ignore[no-untyped-def]
+    """Adds passes times light to new. Four terms at a time, in slices: the compiler makes vectors of nothing else that
+    was tried, and what is added to is read and written once in four times."""
+    colour = 3 * STEP
+    for k in range(len(start) - 1):
+        o = new[k * colour : (k + 1) * colour]
+        for t in range(start[k], start[k + 1], 4):
+            i0, i1, i2, i3 = ti[t], ti[t + 1], ti[t + 2], ti[t + 3]
+            j0, j1, j2, j3 = tj[t], tj[t + 1], tj[t + 2], tj[t + 3]
+            v0, v1, v2, v3 = value[t], value[t + 1], value[t + 2], value[t + 3]
+            a, b, c, d = (
+                passes[i0 : i0 + LANES],
+                passes[i1 : i1 + LANES],
+                passes[i2 : i2 + LANES],
+                passes[i3 : i3 + LANES],
+            )
+            x, y, z, w = (
+                light[j0 : j0 + colour],
+                light[j1 : j1 + colour],
+                light[j2 : j2 + colour],
+                light[j3 : j3 + colour],
+            )
+            for lane in range(LANES):
+                p, q, r, s = v0 * a[lane], v1 * b[lane], v2 * c[lane], v3 * d[lane]
+                g, h = STEP + lane, 2 * STEP + lane
+                o[lane] += p * x[lane] + q * y[lane] + r * z[lane] + s * w[lane]
+                o[g] += p * x[g] + q * y[g] + r * z[g] + s * w[g]
+                o[h] += p * x[h] + q * y[h] + r * z[h] + s * w[h]

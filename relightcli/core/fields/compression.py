@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -66,19 +67,25 @@ class CompressedTransfer:
 
     def reflect(self, light: NDArray[np.floating], which: NDArray[np.integer]) -> NDArray[np.float32]:
         """Radiance (k, 3, N) float32 of the object seen from samples `which` (k,), light (m, 3, N) at its proxies."""
-        m, n, _, colours = self.shape
+        n = self.shape[1]
         used = np.bincount(self.cluster[which], minlength=len(self.start) - 1) > 0
         rows = np.flatnonzero(np.repeat(used, np.diff(self.start)))
-        # (m, N in, C) against (E, m, N out, N in, C), by the components of clusters that are read alone
+        # By the components of clusters that are read alone.
         seen = np.empty((len(self.component), 3, n), np.float32)
         light = np.ascontiguousarray(light, np.float32)
-        _apply(self.component.reshape(-1, m, n, n, colours), self.scale, light, rows, seen)
+        _apply(self._by_output, self.scale, light, rows, seen)
         out = np.empty((len(which), 3, n), np.float32)
         _combine(
             which, self.cluster, self.start, self.first, self.coefficient, self.coefficient_scale,
             seen.reshape(len(seen), 3 * n), out.reshape(len(out), 3 * n),
         )  # fmt: skip
         return out
+
+    @cached_property
+    def _by_output(self) -> NDArray[Any]:
+        """The components as (E, N out, C, m, N in): every coefficient of what is sent is one long sum."""
+        whole = self.component.reshape(-1, *self.shape)
+        return np.ascontiguousarray(whole.transpose(0, 2, 4, 1, 3))
 
     def decompress(self, start: int = 0, stop: int | None = None) -> NDArray[np.float32]:
         """The transfer (samples, m, N, N, C) float32 of the samples start .. stop."""
@@ -260,23 +267,30 @@ def _round(rows: NDArray[np.float64], step: NDArray[np.float64]) -> tuple[NDArra
     return np.clip(np.rint(rows / steps[:, None]), -_MOST, _MOST).astype(np.int16), scale
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 def _apply(component, scale, light, rows, out):  # type: ignore[no-untyped-def]
-    """E L of components e = rows[r] (of (E, m, N, N, C)), of scale[e], into out[e] (3, N)."""
-    colours = component.shape[4]
+    """E L of components e = rows[r] of (E, N out, C, m, N in), of scale[e], into out[e] (3, N)."""
+    size = light.shape[0] * light.shape[2]
+    laid = np.ascontiguousarray(light.transpose(1, 0, 2)).reshape(3, size)
+    flat = component.reshape(len(component), component.shape[1], component.shape[2], size)
+    red, green, blue = laid[0], laid[1], laid[2]
     for r in range(len(rows)):
         e = rows[r]
-        for i in range(component.shape[2]):
-            for c in range(3):
-                total = np.float32(0.0)
-                for k in range(component.shape[1]):
-                    if colours == 1:
-                        for j in range(component.shape[3]):
-                            total += np.float32(component[e, k, i, j, 0]) * light[k, c, j]
-                    else:
-                        for j in range(component.shape[3]):
-                            total += np.float32(component[e, k, i, j, c]) * light[k, c, j]
-                out[e, c, i] = scale[e] * total
+        for i in range(flat.shape[1]):
+            p, q, w = flat[e, i, 0], flat[e, i, flat.shape[2] // 2], flat[e, i, flat.shape[2] - 1]
+            x = y = z = np.float32(0.0)
+            if flat.shape[2] == 1:
+                for k in range(size):
+                    value = np.float32(p[k])
+                    x += value * red[k]
+                    y += value * green[k]
+                    z += value * blue[k]
+            else:
+                for k in range(size):
+                    x += np.float32(p[k]) * red[k]
+                    y += np.float32(q[k]) * green[k]
+                    z += np.float32(w[k]) * blue[k]
+            out[e, 0, i], out[e, 1, i], out[e, 2, i] = scale[e] * x, scale[e] * y, scale[e] * z
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
@@ -285,9 +299,17 @@ def _combine(which, cluster, start, first, coefficient, scale, seen, out):  # ty
         s = which[r]
         a = start[cluster[s]]
         at = first[s]
-        for k in range(seen.shape[1]):
-            out[r, k] = seen[a, k]
-        for j in range(first[s + 1] - at):
-            alpha = coefficient[at + j] * scale[a + 1 + j]
-            for k in range(seen.shape[1]):
-                out[r, k] += alpha * seen[a + 1 + j, k]
+        own = out[r]
+        own[:] = seen[a]
+        count = first[s + 1] - at
+        for j in range(0, count - count % 4, 4):
+            b, p = a + 1 + j, at + j
+            w, x = coefficient[p] * scale[b], coefficient[p + 1] * scale[b + 1]
+            y, z = coefficient[p + 2] * scale[b + 2], coefficient[p + 3] * scale[b + 3]
+            e, f, g, h = seen[b], seen[b + 1], seen[b + 2], seen[b + 3]
+            for k in range(len(own)):
+                own[k] += w * e[k] + x * f[k] + y * g[k] + z * h[k]
+        for j in range(count - count % 4, count):
+            w, term = coefficient[at + j] * scale[a + 1 + j], seen[a + 1 + j]
+            for k in range(len(own)):
+                own[k] += w * term[k]

@@ -145,9 +145,12 @@ class Entity:
 
 
 def turn_together(entities: list[Entity], order: int) -> None:
-    """Makes the turns of all entities at once, which costs little more than one."""
-    for entity, turn in zip(entities, rotation_matrices(np.stack([e.rotation for e in entities]), order), strict=True):
-        entity.turns[order] = turn
+    """Makes the turns that are missing of all entities at once, which costs little more than one."""
+    new = [entity for entity in entities if order not in entity.turns]
+    if new:
+        turns = rotation_matrices(np.stack([e.rotation for e in new]), order)
+        for entity, turn in zip(new, turns, strict=True):
+            entity.turns[order] = turn
 
 
 class Lookup(NamedTuple):
@@ -225,9 +228,9 @@ def look_up(entities: list[Entity], points: NDArray[np.floating], skip: NDArray[
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _visit(  # type: ignore[no-untyped-def]
     points, skip, e, start, rotation, translation, scale, center, box, radius, radii, logarithmic, padded, stand_in,
-    index, weight, distance, inside, read,
+    clear, index, weight, distance, inside, read,
 ):  # fmt: skip
-    squares, steps = shell_steps(radii, logarithmic)
+    steps = shell_steps(radii, logarithmic)
     # Into the entity's frame, about its centre: turned by the inverse, which is the transpose.
     turn, t = rotation / scale, (translation[0], translation[1], translation[2])
     low = (box[0, 0] - center[0], box[0, 1] - center[1], box[0, 2] - center[2])
@@ -245,9 +248,9 @@ def _visit(  # type: ignore[no-untyped-def]
         outside = max(bx, 0.0) ** 2 + max(by, 0.0) ** 2 + max(bz, 0.0) ** 2
         to_box = math.sqrt(outside) if outside > 0.0 else max(bx, by, bz)
         distance[i, e] = scale * max(to_box, math.sqrt(square) - radius)
-        inside[i, e] = square < squares[0]
+        inside[i, e] = square < steps[0, 0]
         own, w = index[i, e], weight[i, e]
-        locate_one(x, y, z, radii, squares, steps, logarithmic, padded, stand_in, own, w)
+        locate_one(x, y, z, steps, logarithmic, padded, stand_in, clear, own, w)
         for k in range(CORNERS):
             own[k] += start
             if w[k] > 0.0:

@@ -32,13 +32,14 @@ class Grid(NamedTuple):
 
     radii (S,) float64, rising; logarithmic: weights between shells; padded (6, n + 2, n + 2) int32, texels of the faces
     and of the rows around them, -1 in the corners; stand_in (S 6nn,) int32: the sample itself where it is valid, else
-    the next one further out in its direction, or -1.
+    the next one further out in its direction, or -1; clear: of this shell and all further out every sample is valid.
     """
 
     radii: NDArray[np.float64]
     logarithmic: bool
     padded: NDArray[np.int32]
     stand_in: NDArray[np.int32]
+    clear: int
 
 
 def make_grid(
@@ -55,7 +56,9 @@ def make_grid(
     stand_in = np.where(True if valid is None else valid, own, -1).astype(np.int32)
     for shell in range(len(radii) - 2, -1, -1):
         stand_in[shell] = np.where(stand_in[shell] < 0, stand_in[shell + 1], stand_in[shell])
-    return Grid(radii, logarithmic, _padded(resolution), stand_in.reshape(-1))
+    missing = np.flatnonzero((stand_in != own).any(axis=1))
+    clear = int(missing[-1]) + 1 if len(missing) else 0
+    return Grid(radii, logarithmic, _padded(resolution), stand_in.reshape(-1), clear)
 
 
 @lru_cache(maxsize=8)
@@ -78,7 +81,7 @@ def locate(grid: Grid, points: NDArray[np.floating]) -> tuple[NDArray[np.int32],
     """
     p = np.ascontiguousarray(points, np.float64)
     index, weight = np.empty((len(p), CORNERS), np.int32), np.empty((len(p), CORNERS), np.float32)
-    _locate(p, grid.radii, grid.logarithmic, grid.padded, grid.stand_in, index, weight)
+    _locate(p, *grid, index, weight)
     return index, weight
 
 
@@ -94,16 +97,20 @@ def blend(
 
 @njit(cache=True, nogil=True)
 def shell_steps(radii, logarithmic):  # type: ignore[no-untyped-def]
-    """Squares of the radii, and 1 / the step from each to the next, in the measure that weights are linear in."""
-    squares, inverse = radii * radii, np.zeros(len(radii))
+    """Of all shells (S, 3): the square of the radius, the radius in the measure that weights are linear in, and 1 / the
+    step to the next in it."""
+    out = np.zeros((len(radii), 3))
+    for k in range(len(radii)):
+        out[k, 0] = radii[k] * radii[k]
+        out[k, 1] = 0.5 * math.log(out[k, 0]) if logarithmic else radii[k]
     for k in range(len(radii) - 1):
-        inverse[k] = 1.0 / (math.log(radii[k + 1] / radii[k]) if logarithmic else radii[k + 1] - radii[k])
-    return squares, inverse
+        out[k, 2] = 1.0 / (out[k + 1, 1] - out[k, 1])
+    return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def locate_one(x, y, z, radii, squares, inverse, logarithmic, padded, stand_in, index, weight):  # type: ignore[no-untyped-def]
-    """The samples and weights of one point, into index and weight (8,); squares, inverse from `shell_steps`."""
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, inline="always")
+def locate_one(x, y, z, steps, logarithmic, padded, stand_in, clear, index, weight):  # type: ignore[no-untyped-def]
+    """The samples and weights of one point, into index and weight (8,); steps from `shell_steps`."""
     n = padded.shape[1] - 2
     square = x * x + y * y + z * z
     ax, ay, az = abs(x), abs(y), abs(z)
@@ -122,43 +129,54 @@ def locate_one(x, y, z, radii, squares, inverse, logarithmic, padded, stand_in, 
     u, v = (s + 1.0) * 0.5 * n + 0.5, (t + 1.0) * 0.5 * n + 0.5  # in padded texels, whose centres are whole numbers
     j, i = min(max(int(u), 0), n), min(max(int(v), 0), n)
     u, v = u - j, v - i
-    last = len(radii) - 1
+    last = len(steps) - 1
     low, along, fade = 0, 0.0, 1.0
-    if square >= squares[last]:
-        low, fade = last, squares[last] / square
-    elif square > squares[0]:
-        while squares[low + 1] <= square:
+    if square >= steps[last, 0]:
+        low, fade = last, steps[last, 0] / square
+    elif square > steps[0, 0]:
+        measure = 0.5 * math.log(square) if logarithmic else math.sqrt(square)
+        # As if all steps were like the first; then to where it is.
+        low = min(int((measure - steps[0, 1]) * steps[0, 2]), last - 1)
+        while steps[low + 1, 0] <= square:
             low += 1
-        if logarithmic:
-            along = 0.5 * math.log(square / squares[low]) * inverse[low]
-        else:
-            along = (math.sqrt(square) - radii[low]) * inverse[low]
+        while steps[low, 0] > square:
+            low -= 1
+        along = min(max((measure - steps[low, 1]) * steps[low, 2], 0.0), 1.0)
     high = min(low + 1, last)
     weight[0], weight[1] = (1.0 - u) * (1.0 - v), u * (1.0 - v)
     weight[2], weight[3] = (1.0 - u) * v, u * v
     index[0], index[1] = padded[face, i, j], padded[face, i, j + 1]
     index[2], index[3] = padded[face, i + 1, j], padded[face, i + 1, j + 1]
-    for k in range(4):
-        if index[k] < 0:
-            third = weight[k] / 3.0
-            weight[k] = 0.0
-            for other in range(4):
-                if other != k:
-                    weight[other] += third
-            index[k] = index[(k + 1) % 4]
-    total = 0.0
+    if (i == 0 or i == n) and (j == 0 or j == n):
+        for k in range(4):
+            if index[k] < 0:
+                third = weight[k] / 3.0
+                weight[k] = 0.0
+                for other in range(4):
+                    if other != k:
+                        weight[other] += third
+                index[k] = index[(k + 1) % 4]
     texels = 6 * n * n
+    near, far = (1.0 - along) * fade, along * fade
     for k in range(4):
         w = weight[k]
         at = index[k]
-        index[k], weight[k] = low * texels + at, w * (1.0 - along)
-        index[k + 4], weight[k + 4] = high * texels + at, w * along
+        index[k], weight[k] = low * texels + at, w * near
+        index[k + 4], weight[k + 4] = high * texels + at, w * far
+    if low < clear:
+        _leave_out(stand_in, fade, index, weight)
+
+
+@njit(cache=True, nogil=True)
+def _leave_out(stand_in, fade, index, weight):  # type: ignore[no-untyped-def]
+    """Gives the weights of samples that are not valid to the others; all of them together weigh `fade`."""
+    total = 0.0
     for k in range(8):
         if stand_in[index[k]] == index[k]:
             total += weight[k]
-    if total >= 1.0 - 1e-12:
-        scale = fade
-    elif total > _LEAST:
+    if total >= (1.0 - 1e-12) * fade:
+        return
+    if total > _LEAST * fade:
         for k in range(8):
             if stand_in[index[k]] != index[k]:
                 weight[k] = 0.0
@@ -172,14 +190,14 @@ def locate_one(x, y, z, radii, squares, inverse, logarithmic, padded, stand_in, 
             else:
                 index[k] = at
                 left += weight[k]
-        scale = fade / left if left > _LEAST else 0.0
+        scale = fade / left if left > _LEAST * fade else 0.0
     for k in range(8):
         weight[k] *= scale
 
 
 @njit(cache=True, nogil=True)
-def _locate(points, radii, logarithmic, padded, stand_in, index, weight):  # type: ignore[no-untyped-def]
-    squares, inverse = shell_steps(radii, logarithmic)
+def _locate(points, radii, logarithmic, padded, stand_in, clear, index, weight):  # type: ignore[no-untyped-def]
+    steps = shell_steps(radii, logarithmic)
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        locate_one(x, y, z, radii, squares, inverse, logarithmic, padded, stand_in, index[i], weight[i])
+        locate_one(x, y, z, steps, logarithmic, padded, stand_in, clear, index[i], weight[i])
