@@ -183,7 +183,8 @@ def _errors_of_transfer(store: formats.Store, found: dict[str, Row]) -> Iterator
         if "rest" in decision:
             yield "planning", "at most, of further interreflections", decision["rest"]
     for tried in store.attrs.get("tried", []):
-        if tried["light_resolution"] == store.settings["light_resolution"]:
+        kept = ("light_resolution", 64), ("pixel_grid", 1)
+        if all(tried.get(key, least) == store.settings.get(key, least) for key, least in kept):
             yield "resolution", f"of direct light at {tried['light_resolution']} texels", tried["share"]
     if "wrong_bits" in found.get("visibility", {}):
         yield "visibility", "of the bits are wrong", found["visibility"]["wrong_bits"]

@@ -9,7 +9,7 @@ import relight_formats as formats
 from relightcli import __version__
 from relightcli.adapters.files import need_output
 from relightcli.run import blocks as run
-from relightcli.run.accounting import Account
+from relightcli.run.accounting import Account, children_seconds
 from relightcli.scene.build import scene_to_json
 from relightcli.scene.model import Geometry
 from relightcli.stages.budget import summary
@@ -30,6 +30,7 @@ WRONG_BITS = 1e-3  # share of wrong bits above which the user is told
 def precompute(config: Config) -> dict[str, Any]:
     """Runs the stage; returns a summary for the user. Raises the errors of `relightcli.errors` and OSError."""
     started, account = time.perf_counter(), Account()
+    before = time.process_time() + children_seconds()
     need_output(config.output)
     run.need_scheduler(None if config.dry_run else config.scheduler)
     prepared = prepare(config, account)
@@ -58,7 +59,7 @@ def precompute(config: Config) -> dict[str, Any]:
             {
                 "scene": scene_to_json(scene, geometry),
                 "plan": prepared.plan_rows(),
-                "tried": [{"light_resolution": r, "share": e.share, "where": e.where} for r, e in prepared.tried],
+                "tried": prepared.tried_rows(),
                 "nothing_blocks": config.effects == "auto" and not prepared.shadows,
             }
         )
@@ -98,7 +99,7 @@ def precompute(config: Config) -> dict[str, Any]:
         if prepared.promise is not None:
             with account.step("check"):
                 keep_promise(
-                    config,
+                    prepared.config,
                     prepared.promise,
                     prepared.resolution,
                     prepared.finer_helps,
@@ -110,7 +111,8 @@ def precompute(config: Config) -> dict[str, Any]:
                     writer,
                 )
         writer.commit(summary(account, started, resumed, config.workers))
-    return _summary(config, started, resumed, geometry)
+    cpu_seconds = time.process_time() + children_seconds() - before
+    return {**_summary(config, started, resumed, geometry), "cpu_seconds": cpu_seconds}
 
 
 def _settings(prepared: Prepared) -> dict[str, Any]:
@@ -126,8 +128,8 @@ def _settings(prepared: Prepared) -> dict[str, Any]:
         "seed": config.seed,
         "bounces": prepared.bounces,
     }
-    if config.pixel_grid != 1:
-        settings["pixel_grid"] = config.pixel_grid
+    if config.grid != 1:
+        settings["pixel_grid"] = config.grid
     if prepared.bounce_cells:
         settings["bounce_resolution"] = prepared.bounce_cells
     if prepared.moving is not None:

@@ -23,7 +23,7 @@ from relightcli.scene.parse import load_scene
 from relightcli.stages.fields import Moving, add_points, find_movers, place, without
 from relightcli.stages.inputs import named_files, stamps
 from relightcli.stages.precompute_config import RESOLUTION, Config, check_bounces, check_config
-from relightcli.stages.promise import choose, try_resolutions
+from relightcli.stages.promise import Tried, choose, try_settings
 from relightcli.stages.receiver_setup import (
     PixelReceivers,
     check_receivers,
@@ -56,7 +56,7 @@ class Prepared:
     moving: Moving | None
     promise: float | None  # the error to keep
     resolution: int = RESOLUTION
-    tried: tuple[tuple[int, pilot.Share], ...] = ()  # resolutions, each with its error
+    tried: tuple[Tried, ...] = ()  # settings, each with its error
     read: dict[Path, tuple[int, int, int]] = field(default_factory=dict)  # `stamps` of the scene's files before that
 
     @property
@@ -71,7 +71,7 @@ class Prepared:
     @property
     def finer_helps(self) -> bool:
         """Whether a finer resolution of light could bring the error down, as far as was tried."""
-        return not self.tried or self.resolution == self.tried[-1][0]
+        return not self.tried or self.resolution == self.tried[-1].resolution
 
     @property
     def posed(self) -> tuple[int, ...]:
@@ -84,6 +84,15 @@ class Prepared:
     def plan_rows(self) -> list[dict[str, Any]]:
         """The plan as it is stored; what was not measured is left out."""
         return [_row(decision) for decision in self.plan]
+
+    def tried_rows(self) -> list[dict[str, Any]]:
+        """What was tried, as it is stored."""
+        grids = self.config.receivers != "vertices"
+        return [
+            {"light_resolution": t.resolution, "share": t.error.share, "where": t.error.where}
+            | ({"pixel_grid": t.grid} if grids else {})
+            for t in self.tried
+        ]
 
     def receivers(self) -> tuple[Receivers | PixelReceivers, NDArray[np.bool_] | None, tuple[int, ...]]:
         """The receivers; which of them are buried, (N,), where there are any on vertices; and the first receiver of
@@ -102,7 +111,7 @@ class Prepared:
             return vertices, np.concatenate([buried, np.zeros(len(vertices) - len(buried), bool)]), starts
         seen = geometry if config.receivers == "vertices" else self.source
         bounces = bool(self.bounce_cells)
-        asked = make_receivers(config.receivers, scene, seen, both, config.pixel_grid, fine=bounces)
+        asked = make_receivers(config.receivers, scene, seen, both, config.grid, fine=bounces)
         if isinstance(asked, PixelReceivers) and not bounces:
             return asked, None, (0,)
         vertices = on_vertices(geometry, both) if isinstance(asked, PixelReceivers) else asked
@@ -180,12 +189,20 @@ def prepare(config: Config, account: Account) -> Prepared:
         config.light_resolution or RESOLUTION,
         read=read,
     )
-    if config.light_resolution is None and promise is not None:
-        with account.step("resolution"):
-            receivers, buried, _ = prepared.receivers()
-            tried = try_resolutions(config, scene, source, geometry, receivers, buried, promise)
-        return replace(prepared, resolution=choose(tried, promise), tried=tuple(tried))
-    return prepared
+    on_pixels = config.receivers != "vertices"
+    if promise is None or (config.light_resolution is not None and (config.pixel_grid is not None or not on_pixels)):
+        return prepared
+
+    def receivers_of(grid: int) -> tuple[Receivers | PixelReceivers, NDArray[np.bool_] | None]:
+        own = config if grid == config.grid else replace(config, pixel_grid=grid)
+        return replace(prepared, config=own).receivers()[:2]
+
+    with account.step("resolution"):
+        tried = try_settings(config, scene, source, geometry, receivers_of, promise)
+    chosen = choose(tried, promise)
+    if on_pixels:
+        config = replace(config, pixel_grid=chosen.grid)
+    return replace(prepared, config=config, resolution=chosen.resolution, tried=tuple(tried))
 
 
 class _Pilot:
