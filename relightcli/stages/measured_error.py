@@ -99,6 +99,12 @@ def edited(materials: dict[str, Material]) -> dict[str, Material]:
     }
 
 
+def edit_of(materials: dict[str, Material], editable: set[str]) -> dict[str, Material] | None:
+    """`edited`, of those that the light can be edited of; None where that changes nothing."""
+    changed = {name: edited({name: m})[name] if name in editable else m for name, m in materials.items()}
+    return changed if changed != materials else None
+
+
 @dataclass(frozen=True)
 class Strips:
     """Rows of a camera's picture, and how receivers make them: one matrix for each range of rows."""
@@ -262,16 +268,16 @@ class Judge:
         skies: dict[str, Sky],
         bounces: int,
         truth: int,
-        edits: bool,
+        edit: dict[str, Material] | None,
         most: float,
         seed: int = 1000,
     ) -> Share:
         """The largest error of the receivers' light with `bounces` against `truth` interreflections. Truth whose noise
-        hides whether that is more than `most` is traced on."""
+        hides whether that is more than `most` is traced on. edit: materials for every second sky."""
         worst = NOTHING
         changes = [self.scene.materials]
-        if edits and any(m.adjustable for m in self.scene.materials.values()):
-            changes.append(edited(self.scene.materials))
+        if edit is not None:
+            changes.append(edit)
         for view in strips:
             eye = np.array(view.camera.eye)
             d = eye - lighting.position
@@ -354,7 +360,7 @@ def trial(
     out: list[tuple[int, Share]] = []
     for resolution in resolutions:
         lighting = Trial(judge.scene, geometry, points.at(rows), buried[rows], tracer, resolution, refine, seed)
-        out.append((resolution, judge.error(lighting, strips, skies, 0, 0, False, most)))
+        out.append((resolution, judge.error(lighting, strips, skies, 0, 0, None, most)))
         share = out[-1][1].share
         if share <= most or (len(out) > 2 and share > max(HOPELESS * most, (1.0 - GAIN) * out[-3][1].share)):
             break

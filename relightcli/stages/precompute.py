@@ -20,7 +20,8 @@ from relightcli.stages.lay_out import make_job, put_scene
 from relightcli.stages.pose_job import simulate_poses
 from relightcli.stages.precompute_config import Config
 from relightcli.stages.prepare import Prepared, prepare
-from relightcli.stages.promise import keep_promise
+from relightcli.stages.promise import keep_promise, keep_promise_moving
+from relightcli.stages.promise_moving import choose_fields
 from relightcli.stages.visibility_job import block_size, create_outputs
 
 KIND = "transfer"
@@ -81,7 +82,10 @@ def precompute(config: Config) -> dict[str, Any]:
             run.close_worker()
         if moving is not None:
             with account.step("fields"):
-                put_fields(writer, moving, scene, config.fields, config.workers, config.quiet, config.scheduler)
+                if prepared.promise is None:
+                    put_fields(writer, moving, scene, config.fields, config.workers, config.quiet, config.scheduler)
+                else:
+                    choose_fields(config, prepared.promise, scene, source, starts, writer)
         if "pose" in prepared.simulated:
             with account.step("pose"):
                 simulate_poses(
@@ -96,7 +100,10 @@ def precompute(config: Config) -> dict[str, Any]:
                     config.quiet,
                     config.scheduler,
                 )
-        if prepared.promise is not None:
+        if prepared.promise is not None and moving is not None:
+            with account.step("check"):
+                keep_promise_moving(config, prepared.promise, scene, source, writer)
+        elif prepared.promise is not None:
             with account.step("check"):
                 keep_promise(
                     prepared.config,
@@ -134,6 +141,8 @@ def _settings(prepared: Prepared) -> dict[str, Any]:
         settings["bounce_resolution"] = prepared.bounce_cells
     if prepared.moving is not None:
         settings["fields"] = config.fields.as_json()
+    if prepared.promise is not None:
+        settings["tolerance"] = prepared.promise
     if config.basis == "haar":
         settings |= {"coefficients": config.coefficients, "tolerance": config.tolerance}
     if "pose" in prepared.simulated:

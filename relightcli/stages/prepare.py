@@ -24,6 +24,7 @@ from relightcli.stages.fields import Moving, add_points, find_movers, place, wit
 from relightcli.stages.inputs import named_files, stamps
 from relightcli.stages.precompute_config import RESOLUTION, Config, check_bounces, check_config
 from relightcli.stages.promise import Tried, choose, try_settings
+from relightcli.stages.promise_moving import rungs
 from relightcli.stages.receiver_setup import (
     PixelReceivers,
     check_receivers,
@@ -32,8 +33,6 @@ from relightcli.stages.receiver_setup import (
     unburied,
     with_vertices,
 )
-
-MOVING = ("fields", "pose")  # effects
 
 
 @dataclass(frozen=True)
@@ -132,6 +131,8 @@ def prepare(config: Config, account: Account) -> Prepared:
     read = stamps([config.scene.absolute()])
     with account.step("reading"):
         scene = load_scene(config.scene, allow_outside=config.allow_outside)
+        if promise is not None:
+            scene = replace(scene, tolerance=promise)
         read |= stamps(named_files(scene) - read.keys())
         source = build_geometry(scene)
     motions: dict[str, str] = {o.name: o.motion for o in scene.objects.values()}
@@ -149,7 +150,7 @@ def prepare(config: Config, account: Account) -> Prepared:
             bool(both.any()),
             _lobes(scene),
             wanted,
-            scene.tolerance if promise is None else promise,
+            scene.tolerance,
             lambda: _Pilot(scene, source),
             fields.simulate or (asked is None and pose.simulate),
         )
@@ -157,19 +158,19 @@ def prepare(config: Config, account: Account) -> Prepared:
         check_bounces(config)
     plan += [pose, fields]
     simulated = [d.effect for d in plan if d.simulate]
-    if promise is not None and any(name in simulated for name in MOVING):
+    if promise is not None and "pose" in simulated:
         raise InputError(
-            f"--tolerance: {scene.path} has objects that move, and no error is promised for the light about them; "
-            "leave it out, or name effects without fields and pose"
+            f"--tolerance: {scene.path} has characters, and no error is promised for the light on their poses; leave "
+            "it out, or name effects without pose"
         )
     shadows = "shadows" in simulated
     bounce_cells = 0
     if "one-bounce" in simulated:
         coarse = (config.light_resolution or RESOLUTION) % 16
-        planned = 8 if coarse else effects.bounce_cells(plan, promise or scene.tolerance)
+        planned = 8 if coarse else effects.bounce_cells(plan, scene.tolerance)
         bounce_cells = config.bounce_resolution or planned
     with account.step("reading"):
-        moving = _moving(config, scene) if fields.simulate else None
+        moving = _moving(config, scene, promise) if fields.simulate else None
         uncut = source
         if shadows and config.subdivide and (config.receivers == "vertices" or bounce_cells):
             uncut = _subdivided(source, moving)
@@ -227,12 +228,13 @@ def _row(decision: effects.Decision) -> dict[str, Any]:
     return row | {key: value for key, value in measured.items() if value is not None and math.isfinite(value)}
 
 
-def _moving(config: Config, scene: Scene) -> Moving:
+def _moving(config: Config, scene: Scene, promise: float | None) -> Moving:
     """What may be moved. Raises InputError where receivers or settings do not go with it."""
     config.fields.check()
     if config.receivers != "vertices":
         raise InputError("--receivers: objects that move carry their light at vertices; expected vertices")
-    return find_movers(scene, config.fields, config.subdivide, config.seed)
+    first = config.fields if promise is None else rungs(config.fields)[0]
+    return find_movers(scene, first, config.subdivide, config.seed)
 
 
 def _subdivided(geometry: Geometry, moving: Moving | None) -> Geometry:

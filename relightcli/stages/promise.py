@@ -27,11 +27,13 @@ from relightcli.stages.measured_error import (
     Strips,
     check_skies,
     check_views,
+    edit_of,
     pixel_strips,
     rows_of,
     trial,
     vertex_strips,
 )
+from relightcli.stages.promise_moving import check_moved
 from relightcli.stages.receiver_setup import MOST_PIXEL_GRID, PixelReceivers
 
 if TYPE_CHECKING:
@@ -143,6 +145,28 @@ def predict_check(config: Config, scene: Scene, source: Geometry, bounces: int) 
     return {key: times * taken[key] for key in ("seconds", "cpu_seconds")}
 
 
+def keep_promise_moving(config: Config, promise: float, scene: Scene, source: Geometry, writer: formats.Writer) -> None:
+    """`keep_promise` where objects may be moved."""
+    found = check_moved(config, promise, scene, source, writer)
+    _keep(writer, found, promise)
+    if found.share <= promise or config.allow_miss:
+        return
+    order = 1 + int(writer.attrs["fields"]["settings"]["order"])
+    raise NumericalError(
+        f"{config.output}: the error is {found.share:.2%} ({found.where}), more than the tolerance of {promise:.2%}. "
+        f"What would help: --field-order {order}, as which shadows of what moves are sharp, or a finer mesh. The work "
+        f"is kept in {writer.partial_path.name}; the same command with --allow-miss finishes it as it is"
+    )
+
+
+def _keep(writer: formats.Writer, found: pilot.Share, promise: float) -> None:
+    """The error that was found, into the store."""
+    measured: dict[str, Any] = {"share": found.share, "where": found.where}
+    if math.isfinite(found.bound):  # else the two runs do not tell
+        measured["bound"] = found.bound
+    writer.set_attrs({"measured_error": {**measured, "tolerance": promise}})
+
+
 def keep_promise(
     config: Config,
     promise: float,
@@ -164,14 +188,12 @@ def keep_promise(
     strips = _strips(scene, geometry, receivers, buried, check_views(scene, source, _camera_of(config)))
     skies = check_skies()
     bounces = lighting.bounces
-    found = judge.error(lighting, strips, skies, bounces, bounces + MORE, True, promise)
-    measured: dict[str, Any] = {"share": found.share, "where": found.where}
-    if math.isfinite(found.bound):  # else the two runs do not tell
-        measured["bound"] = found.bound
-    writer.set_attrs({"measured_error": {**measured, "tolerance": promise}})
+    edit = edit_of(scene.materials, set(scene.materials))
+    found = judge.error(lighting, strips, skies, bounces, bounces + MORE, edit, promise)
+    _keep(writer, found, promise)
     if found.share <= promise or config.allow_miss:
         return
-    direct = judge.error(lighting, strips, skies, 0, 0, False, DIRECT * promise)
+    direct = judge.error(lighting, strips, skies, 0, 0, None, DIRECT * promise)
     if direct.share <= DIRECT * promise:
         knob = f"--bounces {bounces + 1} or a finer --bounce-resolution"
     elif config.receivers == "vertices":
