@@ -153,6 +153,8 @@ def _errors(store: formats.Store, found: dict[str, Row]) -> Iterator[tuple[str, 
     """Step, what was measured, and its share of what is true."""
     if store.kind == "transfer":
         yield from _errors_of_transfer(store, found)
+    if store.kind == "asset" and "asset_tolerance" in store.settings:
+        yield "check", "of radiance, all stages together", store.attrs["measured_error"]["share"]
     if "light-basis" in found:
         yield "light-basis", "of one bounce at held-out receivers", found["light-basis"]["error"]
         yield "groups", "of one bounce, by groups of 16 eigenvectors", found["groups"]["error"]
