@@ -18,10 +18,10 @@ from relightcli.cli import options
 )
 @click.option(
     "--tolerance",
-    default=0.01,
-    show_default=True,
+    default=None,
     type=float,
-    help="Relative RMS of interreflections that the basis for light may leave out.",
+    help="Relative RMS of interreflections that the basis for light may leave out. Default: a part of what precompute "
+    "has left of its tolerance, else 0.01.",
 )
 @click.option(
     "--functions",

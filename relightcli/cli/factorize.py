@@ -15,13 +15,15 @@ from relightcli.cli import options
 @options.output("Asset to make, e.g. asset.zarr.")
 @click.option(
     "--eigenvectors",
-    default=32,
-    show_default=True,
+    default=None,
     type=click.IntRange(1, 4096),
-    help="Rank along the receivers of a cluster.",
+    help="Rank along the receivers of a cluster. Default: 32, or what the tolerance takes.",
 )
 @click.option(
-    "--light-rank", default=64, show_default=True, type=click.IntRange(1, 4096), help="Rank along light, per cluster."
+    "--light-rank",
+    default=None,
+    type=click.IntRange(1, 4096),
+    help="Rank along light, per cluster. Default: 64, or what the tolerance takes.",
 )
 @click.option(
     "--second-order",
@@ -32,11 +34,18 @@ from relightcli.cli import options
 )
 @click.option(
     "--coefficients",
-    default=96,
-    show_default=True,
+    default=None,
     type=click.IntRange(1, 1 << 16),
-    help="Haar coefficients of direct light kept per receiver and light factor.",
+    help="Haar coefficients of direct light kept per receiver and light factor. Default: 96, or what the tolerance "
+    "takes.",
 )
+@click.option(
+    "--tolerance",
+    default=None,
+    type=float,
+    help="Relative RMS error of radiance to keep, all stages together. Default: that of the store, if it has one.",
+)
+@click.option("--allow-miss", is_flag=True, help="Keep the asset where its error is larger than the tolerance.")
 @click.option("--dry-run", is_flag=True, help="Say what would be made; do nothing.")
 @options.workers
 @options.scheduler

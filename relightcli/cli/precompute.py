@@ -29,7 +29,12 @@ from relightcli.cli import options
     "--refine", default=4, show_default=True, help="Visibility is probed every N texels and refined; 1 traces them all."
 )
 @click.option("--receivers", default="vertices", show_default=True, help="vertices, or pixels:CAMERA.")
-@click.option("--pixel-grid", default=1, show_default=True, help="Receivers along a pixel's side, for pixels:CAMERA.")
+@click.option(
+    "--pixel-grid",
+    default=None,
+    type=int,
+    help="Receivers along a pixel's side, for pixels:CAMERA. Default: 1, or what --tolerance takes.",
+)
 @click.option(
     "--subdivide/--no-subdivide", default=True, help="Cut faces that are too large to carry shadows. Default: cut."
 )

@@ -44,6 +44,12 @@ def peak_bytes() -> float:
     return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
+def children_seconds() -> float:
+    """Seconds of the processors that this process's children took, of those that have ended, and theirs."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
 class Account:
     """Costs by step, in the order in which they were begun. Steps do not overlap, so that they add up."""
 

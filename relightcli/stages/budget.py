@@ -153,6 +153,8 @@ def _errors(store: formats.Store, found: dict[str, Row]) -> Iterator[tuple[str, 
     """Step, what was measured, and its share of what is true."""
     if store.kind == "transfer":
         yield from _errors_of_transfer(store, found)
+    if store.kind == "asset" and "asset_tolerance" in store.settings:
+        yield "check", "of radiance, all stages together", store.attrs["measured_error"]["share"]
     if "light-basis" in found:
         yield "light-basis", "of one bounce at held-out receivers", found["light-basis"]["error"]
         yield "groups", "of one bounce, by groups of 16 eigenvectors", found["groups"]["error"]
@@ -183,7 +185,8 @@ def _errors_of_transfer(store: formats.Store, found: dict[str, Row]) -> Iterator
         if "rest" in decision:
             yield "planning", "at most, of further interreflections", decision["rest"]
     for tried in store.attrs.get("tried", []):
-        if tried["light_resolution"] == store.settings["light_resolution"]:
+        kept = ("light_resolution", 64), ("pixel_grid", 1)
+        if all(tried.get(key, least) == store.settings.get(key, least) for key, least in kept):
             yield "resolution", f"of direct light at {tried['light_resolution']} texels", tried["share"]
     if "wrong_bits" in found.get("visibility", {}):
         yield "visibility", "of the bits are wrong", found["visibility"]["wrong_bits"]

@@ -23,12 +23,14 @@ from relightcli.core.compress.tucker import gram_spectrum
 from relightcli.errors import InputError, StoreError
 from relightcli.run.accounting import Account, Meter
 from relightcli.stages.budget import summary
+from relightcli.stages.left_over import basis_tolerance, left_over, spend
 from relightcli.stages.lighting import LightingStore, need_still
 from relightcli.stages.transfer_setup import BLOCK, CELLS, TransferSetup, coarse_cells
 
 KIND = "clusters"
 ORDER = 4  # bands of the tensors
 TERMS = 16  # eigenvectors of a cluster when receivers are grouped
+TOLERANCE = 0.01  # of the basis for light, unless there is a reason for another
 SKETCH = 128  # random directions that stand in for a receiver's tensor
 SAMPLE = 1024  # receivers whose full tensors show what light they react to
 RECEIVERS_PER_CLUSTER = 1000
@@ -37,12 +39,13 @@ LARGEST = 2.0  # a cluster with more than so many times the mean is cut: the cos
 
 @dataclass(frozen=True)
 class Config:
-    """Everything that `cluster` needs to know. `clusters` None: one per 1000 receivers."""
+    """Everything that `cluster` needs to know. `clusters` None: one per 1000 receivers; tolerance None: a part of what
+    is left of the store's, else TOLERANCE."""
 
     store: Path
     output: Path
     clusters: int | None = None
-    tolerance: float = 0.01
+    tolerance: float | None = None
     functions: int = FUNCTIONS
     seed: int = 0
     workers: int = 1
@@ -54,7 +57,7 @@ class Config:
 def cluster(config: Config) -> dict[str, Any]:
     """Runs the stage; returns a summary. Raises InputError, StoreError, NumericalError, OSError."""
     started, account = time.perf_counter(), Account()
-    if not 0.0 < config.tolerance < 1.0:
+    if config.tolerance is not None and not 0.0 < config.tolerance < 1.0:
         raise InputError(f"--tolerance: expected more than 0 and less than 1; found {config.tolerance}")
     need_output(config.output, store=True)
     with account.step("reading"):
@@ -63,11 +66,12 @@ def cluster(config: Config) -> dict[str, Any]:
     if lighting.store.kind != "transfer":
         raise StoreError(f"{config.store}: expected a store of kind transfer, found {lighting.store.kind}.")
     _need_bounces(lighting)
+    tolerance = config.tolerance or basis_tolerance(lighting.store) or TOLERANCE
     clusters = config.clusters or max(1, round(len(lighting) / RECEIVERS_PER_CLUSTER))
     settings = {
         **lighting.store.settings,
         "clusters": clusters,
-        "cluster_tolerance": config.tolerance,
+        "cluster_tolerance": tolerance,
         "functions": config.functions,
         "cluster_seed": config.seed,
         "order": ORDER,
@@ -94,7 +98,7 @@ def cluster(config: Config) -> dict[str, Any]:
         if "light-basis" not in writer.done:
             with account.step("light-basis"):
                 meter = Meter()
-                basis, held_out = _light_basis(setup, config)
+                basis, held_out = _light_basis(setup, tolerance, config.seed)
                 writer.put("light/basis", basis, dims=("light_cell", "light"))
                 writer.record("light-basis", {**meter.read(), "error": held_out})
         if "groups" not in writer.done:
@@ -106,6 +110,10 @@ def cluster(config: Config) -> dict[str, Any]:
                 writer.put("cluster/label", label, dims=("receiver",))
                 left = float(np.sqrt(found.residuals[-1] / found.norm2)) if found.norm2 else 0.0
                 writer.record("groups", {**meter.read(), "clusters": int(label.max()) + 1, "error": left})
+        spare = left_over(lighting.store)
+        if spare is not None:
+            error = next(float(block["error"]) for block in writer.blocks if block["id"] == "light-basis")
+            writer.set_attrs({"spent": spend(lighting.store, "cluster", error * spare.bounced)})
         writer.commit(summary(account, started, resumed, config.workers, lighting.store))
     store = formats.open_store(config.output, KIND)
     info = {block["id"]: block for block in store.blocks}
@@ -184,11 +192,11 @@ def copy_arrays(store: formats.Store, writer: formats.Writer, names: list[str]) 
         writer.record(f"copy/{name}", {})
 
 
-def _light_basis(setup: TransferSetup, config: Config) -> tuple[NDArray[np.float32], float]:
+def _light_basis(setup: TransferSetup, tolerance: float, seed: int) -> tuple[NDArray[np.float32], float]:
     """Basis (6 CELLS^2, L) of what light one-bounce tensors react to, and the relative RMS that it leaves of those of
     receivers that it was not made from."""
     n = len(setup.lighting)
-    picked = np.random.default_rng(config.seed).permutation(n)[:SAMPLE]
+    picked = np.random.default_rng(seed).permutation(n)[:SAMPLE]
     cells = 6 * CELLS * CELLS
     tensors = np.empty((len(picked), setup.count * ORDER * ORDER, cells), np.float32)
     for face in range(6):
@@ -205,7 +213,7 @@ def _light_basis(setup: TransferSetup, config: Config) -> tuple[NDArray[np.float
         gram += part.T @ part
     values, vectors = gram_spectrum(gram)
     left = np.sqrt(np.maximum(0.0, 1.0 - np.cumsum(values) / max(values.sum(), 1e-300)))
-    rank = int(np.argmax(left <= config.tolerance)) + 1 if (left <= config.tolerance).any() else len(values)
+    rank = int(np.argmax(left <= tolerance)) + 1 if (left <= tolerance).any() else len(values)
     basis = np.ascontiguousarray(vectors[:, :rank], np.float32)
     rest = tensors[half:] if len(picked) > half else tensors
     norm2 = float((rest.astype(np.float64) ** 2).sum())

@@ -9,7 +9,6 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ import relight_formats as formats
 from relightcli import __version__
 from relightcli.core.transport.receivers import Receivers
 from relightcli.run import blocks as run
-from relightcli.run.accounting import Account
+from relightcli.run.accounting import Account, Meter, children_seconds
 from relightcli.scene.model import Geometry
 from relightcli.stages.fields import predict
 from relightcli.stages.lay_out import make_job, put_scene
@@ -38,7 +37,8 @@ PARTS = {"shadows": ("trace", "visibility/"), "lights": ("light", "lights/"), "o
 def dry_run(prepared: Prepared, account: Account) -> dict[str, Any]:
     """The plan with its cost, predicted from a pilot: of the whole run, planning included.
 
-    Poses and fields: from the speed of rays, and uncompressed.
+    Poses and fields: from the speed of rays, and uncompressed. Seconds are those of the clock, on the machine as it is;
+    cpu_seconds those of all processes, which others that use the machine change less.
     """
     config = prepared.config
     with account.step("receivers"):
@@ -50,15 +50,19 @@ def dry_run(prepared: Prepared, account: Account) -> dict[str, Any]:
             with account.step("scene"):
                 put_scene(writer, prepared, receivers, buried)
             scene_bytes = _bytes(writer.partial_path)
-            spent, started = _pilot(writer, prepared, receivers, starts)
+            spent, start = _pilot(writer, prepared, receivers, starts)
     if "pose" in prepared.simulated:
         spent["pose"] = _pose_cost(config, prepared.geometry, prepared.both, spent["shadows"])
     if prepared.moving is not None:
-        spent["fields"] = np.array(predict(prepared.moving))
-        spent["fields"][1] /= max(1, config.workers)
-    seconds = sum(cost["seconds"] for cost in account.steps.values()) + started
+        rays, alone, size = predict(prepared.moving)
+        spent["fields"] = np.array([rays, alone / max(1, config.workers), size, alone])
+    seconds, cpu_seconds = (
+        sum(cost[key] for cost in account.steps.values()) + start[key] for key in ("seconds", "cpu_seconds")
+    )
     if prepared.promise is not None:
-        seconds += predict_check(config, prepared.scene, prepared.source, prepared.bounces)
+        check = predict_check(config, prepared.scene, prepared.source, prepared.bounces)
+        seconds += check["seconds"]
+        cpu_seconds += check["cpu_seconds"]
     total = np.sum(list(spent.values()), axis=0)
     rows_of_plan = prepared.plan_rows()
     for row in rows_of_plan:
@@ -76,6 +80,7 @@ def dry_run(prepared: Prepared, account: Account) -> dict[str, Any]:
         "predicted": {
             "rays": int(total[0]),
             "seconds": float(seconds + total[1]),
+            "cpu_seconds": float(cpu_seconds + total[3]),
             "bytes": int(scene_bytes + total[2]),
         },
         "notes": list(prepared.geometry.notes),
@@ -84,45 +89,52 @@ def dry_run(prepared: Prepared, account: Account) -> dict[str, Any]:
 
 def _pilot(
     writer: formats.Writer, prepared: Prepared, receivers: Receivers | PixelReceivers, starts: tuple[int, ...]
-) -> tuple[dict[str, NDArray[np.float64]], float]:
-    """Rays, seconds and bytes by part of the visibility of all receivers; and the seconds until the first is traced."""
+) -> tuple[dict[str, NDArray[np.float64]], dict[str, float]]:
+    """Rays, seconds of the clock, bytes and seconds of all processors by part of the visibility of all receivers; and
+    the seconds of both kinds until the first is traced."""
     count, workers = len(receivers), max(1, prepared.config.workers)
     job = make_job(prepared, str(writer.partial_path), receivers, starts)
-    spent = {name: np.zeros(3) for name in ("shadows", "one-bounce", *(["lights"] if job.lights else []))}
+    spent = {name: np.zeros(4) for name in ("shadows", "one-bounce", *(["lights"] if job.lights else []))}
     if not count:
-        return spent, 0.0
+        return spent, {"seconds": 0.0, "cpu_seconds": 0.0}
     blocks = -(-count // block_size(job.resolution))
-    begun = time.perf_counter()
+    begun, others = Meter(), 0.0
     if blocks > 1 and workers > 1:  # in other processes, which have to start
+        before = children_seconds()
         subprocess.run([sys.executable, "-c", f"import {VisibilityJob.__module__}"], check=True)
+        others = (children_seconds() - before) * min(workers, blocks)
     create_outputs(writer, job, count, RUN)
     worker = job.open()
     runs = -(-count // RUN)
     chosen = np.unique(np.linspace(0, runs - 1, RUNS).round().astype(int))
     worker.run(run.Block("first", int(chosen[0]) * RUN, min(count, (int(chosen[0]) + 1) * RUN)))
-    started = time.perf_counter() - begun
+    start = begun.read()
+    start["cpu_seconds"] += others
     traced = 0
     costs: dict[str, float] = {}
     for number in chosen:
         block = run.Block(f"run/{number}", int(number) * RUN, min(count, (int(number) + 1) * RUN))
         traced += block.stop - block.start
-        clock = time.perf_counter()
+        meter = Meter()
         found = worker.run(block)
+        whole = meter.read()
         # Light in another basis is no part of its own.
-        taken = sum(found.get(f"{part}_seconds", 0.0) for part, _ in PARTS.values())
-        found["rest_seconds"] = time.perf_counter() - clock - taken
+        for key in ("seconds", "cpu_seconds"):
+            found[f"rest_{key}"] = whole[key] - sum(found.get(f"{part}_{key}", 0.0) for part, _ in PARTS.values())
         costs = {key: costs.get(key, 0.0) + value for key, value in found.items()}
     # The share of all receivers that the busiest process has.
     share = min(1.0, -(-blocks // min(workers, blocks)) / blocks)
     for name, (part, prefix) in PARTS.items():
         if f"{part}_rays" in costs:
             size = _bytes(writer.partial_path / prefix)
-            spent[name][:] = costs[f"{part}_rays"], share * costs[f"{part}_seconds"], size
+            seconds, cpu = costs[f"{part}_seconds"], costs[f"{part}_cpu_seconds"]
+            spent[name][:] = costs[f"{part}_rays"], share * seconds, size, cpu
     if job.basis != "visibility":
-        spent["basis"] = np.array([0.0, share * costs["rest_seconds"], _bytes(writer.partial_path / "direct")])
+        size = _bytes(writer.partial_path / "direct")
+        spent["basis"] = np.array([0.0, share * costs["rest_seconds"], size, costs["rest_cpu_seconds"]])
     for cost in spent.values():
         cost *= count / traced
-    return spent, started
+    return spent, start
 
 
 def _bytes(folder: Path) -> int:
@@ -133,12 +145,12 @@ def _bytes(folder: Path) -> int:
 def _pose_cost(
     config: Config, geometry: Geometry, both: NDArray[np.bool_], traced: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Rays, seconds and bytes of the frames of skinned objects, at the speed of the rays of `traced`. both (O,): whose
-    back is lit too."""
+    """As `_pilot`'s, of the frames of skinned objects, at the speed of the rays of `traced`. both (O,): whose back is
+    lit too."""
     rigs = [(rig, both[geometry.object_names.index(name)]) for name, rig in geometry.rigs.items() if rig.clips]
     samples = sum(
         len(choose_frames(rig, config.pose_frames)) * len(rig.position) * (2 if backs else 1) for rig, backs in rigs
     )
     rays = samples * config.pose_directions
-    seconds = rays * traced[1] / traced[0] if traced[0] else 0.0
-    return np.array([rays, seconds, 2.0 * samples * config.pose_order**2])  # float16
+    seconds, cpu = rays * traced[[1, 3]] / traced[0] if traced[0] else (0.0, 0.0)
+    return np.array([rays, seconds, 2.0 * samples * config.pose_order**2, cpu])  # float16

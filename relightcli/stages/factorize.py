@@ -8,7 +8,7 @@ Everything is quantised; every cluster records what compression and quantisation
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +24,15 @@ from relightcli.core.transport.transfer import Sources, light_fit
 from relightcli.errors import InputError, StoreError
 from relightcli.run.accounting import Account, Meter
 from relightcli.stages.budget import summary
+from relightcli.stages.choose_ranks import Ranks, coefficients_for, keep_asset_promise, tensor_ranks
 from relightcli.stages.cluster import copy_arrays
 from relightcli.stages.direct_tensors import put_direct
+from relightcli.stages.left_over import LeftOver, left_over
 from relightcli.stages.lighting import LightingStore
 from relightcli.stages.transfer_setup import COARSE, TransferSetup, coarse_cells, fit_receivers
 
 KIND = "asset"
+DEFAULT = Ranks(32, 64, KEEP)
 # What rounding may add to the one-bounce core, relative RMS: no step is finer than makes that of all its values.
 CORE_ROUNDING = 0.005
 LEFT_OUT = ("bounce/hit", "light/basis", "cluster/label")  # of the clusters store's arrays
@@ -37,14 +40,18 @@ LEFT_OUT = ("bounce/hit", "light/basis", "cluster/label")  # of the clusters sto
 
 @dataclass(frozen=True)
 class Config:
-    """Everything that `factorize` needs to know. second_order: bands of the second bounce, 0 for its mean."""
+    """Everything that `factorize` needs to know. second_order: bands of the second bounce, 0 for its mean; tolerance:
+    relative RMS of all light, None for the store's, if it has one. eigenvectors, light_rank, coefficients None: what
+    the tolerance takes, else DEFAULT."""
 
     store: Path
     output: Path
-    eigenvectors: int = 32
-    light_rank: int = 64
+    eigenvectors: int | None = None
+    light_rank: int | None = None
     second_order: int = 0
-    coefficients: int = KEEP
+    coefficients: int | None = None
+    tolerance: float | None = None
+    allow_miss: bool = False
     workers: int = 1
     overwrite: bool = False
     dry_run: bool = False
@@ -55,8 +62,10 @@ def factorize(config: Config) -> dict[str, Any]:
     """Runs the stage; returns a summary. Raises InputError, StoreError, NumericalError, OSError."""
     started, account = time.perf_counter(), Account()
     for name, value in (("--eigenvectors", config.eigenvectors), ("--light-rank", config.light_rank)):
-        if value < 1:
+        if value is not None and value < 1:
             raise InputError(f"{name}: expected at least 1; found {value}")
+    if config.tolerance is not None and not 0.0 < config.tolerance < 1.0:
+        raise InputError(f"--tolerance: expected more than 0 and less than 1; found {config.tolerance}")
     need_output(config.output, store=True)
     with account.step("reading"):
         lighting = LightingStore(config.store, config.workers)
@@ -67,11 +76,15 @@ def factorize(config: Config) -> dict[str, Any]:
     settings = {
         **store.settings,
         "bounces": bounces,
-        "eigenvectors": config.eigenvectors,
-        "light_rank": config.light_rank,
         "second_order": config.second_order,
-        "coefficients": config.coefficients,
     }
+    left = left_over(store, config.tolerance)
+    for name in ("eigenvectors", "light_rank", "coefficients"):
+        asked = getattr(config, name)
+        if left is None or asked is not None:
+            settings[name] = asked or getattr(DEFAULT, name)
+    if left is not None:
+        settings["asset_tolerance"] = left.tolerance
     read: Any = store.read
     label: NDArray[np.int32] = read("cluster/label")
     clusters = int(label.max()) + 1
@@ -104,20 +117,51 @@ def factorize(config: Config) -> dict[str, Any]:
         basis: NDArray[np.float32] = read("light/basis")
         writer.put("one_bounce/basis", basis, dims=("light_cell", "light"))
         bands = int(store.settings["order"])
+        with account.step("ranks"):
+            ranks = _ranks(config, left, writer, setup, basis, order, start, bands if bounces else 0)
         with account.step("direct"):
-            put_direct(writer, lighting, config.coefficients, config.workers)
+            put_direct(writer, lighting, ranks.coefficients, config.workers)
         if bounces:
             with account.step("one-bounce"):
-                _one_bounce(config, writer, setup, basis, order, start, bands)
+                _one_bounce(ranks, writer, setup, basis, order, start, bands)
         if bounces > 1:
             with account.step("two-bounce"):
-                _two_bounces(config, writer, setup, order, start, bands)
+                _two_bounces(ranks.eigenvectors, config.second_order, writer, setup, order, start, bands)
+        if left is not None:
+            with account.step("check"):
+                keep_asset_promise(writer, left.tolerance, lighting.bounces, config.workers, config.allow_miss)
         writer.commit(summary(account, started, resumed, config.workers, store))
     return _summary(config, started, resumed, notes)
 
 
-def _one_bounce(
+def _ranks(
     config: Config,
+    left: LeftOver | None,
+    writer: formats.Writer,
+    setup: TransferSetup,
+    basis: NDArray[np.float32],
+    order: NDArray[np.int64],
+    start: NDArray[np.int64],
+    bands: int,
+) -> Ranks:
+    """What was asked for, was chosen before an interruption, or is chosen now. bands 0: no interreflections."""
+    asked = (config.eigenvectors, config.light_rank, config.coefficients)
+    given = Ranks(*(value or least for value, least in zip(asked, astuple(DEFAULT), strict=True)))
+    if left is None:
+        return given
+    if "ranks" in writer.attrs:
+        return Ranks(**writer.attrs["ranks"])
+    if config.coefficients is None:
+        given = replace(given, coefficients=coefficients_for(setup.lighting, left))
+    if bands and (config.eigenvectors is None or config.light_rank is None):
+        along, light = tensor_ranks(setup, setup.sources(basis), order, start, bands, left)
+        given = replace(given, eigenvectors=config.eigenvectors or along, light_rank=config.light_rank or light)
+    writer.set_attrs({"ranks": given.as_json()})
+    return given
+
+
+def _one_bounce(
+    ranks: Ranks,
     writer: formats.Writer,
     setup: TransferSetup,
     basis: NDArray[np.float32],
@@ -127,7 +171,7 @@ def _one_bounce(
 ) -> None:
     clusters, most = len(start) - 1, int(np.diff(start).max())
     lights = basis.shape[1] + setup.lamps
-    rank_v, rank_l = min(config.eigenvectors, most), min(config.light_rank, lights)
+    rank_v, rank_l = min(ranks.eigenvectors, most), min(ranks.light_rank, lights)
     rest = setup.count * bands * bands
     outputs = _Outputs(
         writer,
@@ -180,7 +224,8 @@ def _put_fit(writer: formats.Writer, group: str, setup: TransferSetup, sources: 
 
 
 def _two_bounces(
-    config: Config,
+    eigenvectors: int,
+    second_order: int,
     writer: formats.Writer,
     setup: TransferSetup,
     order: NDArray[np.int64],
@@ -188,9 +233,9 @@ def _two_bounces(
     bands: int,
 ) -> None:
     clusters, most = len(start) - 1, int(np.diff(start).max())
-    rank = min(config.eigenvectors, most)
+    rank = min(eigenvectors, most)
     coarse = 6 * COARSE * COARSE + setup.lamps
-    harmonics = max(1, config.second_order**2)
+    harmonics = max(1, second_order**2)
     size = setup.count * harmonics * coarse * setup.count
     outputs = _Outputs(
         writer,
@@ -212,7 +257,7 @@ def _two_bounces(
     for c in todo:
         meter = Meter()
         rows = order[start[c] : start[c + 1]]
-        tensor = setup.gather_rows(rows, sources, config.second_order).reshape(len(rows), size, 1)
+        tensor = setup.gather_rows(rows, sources, second_order).reshape(len(rows), size, 1)
         found = sequential_hosvd(tensor, (rank, None, None))
         u_v = found.factors[0]
         assert u_v is not None

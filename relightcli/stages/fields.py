@@ -129,6 +129,11 @@ class Moving:
     movers: tuple[Mover, ...]
     fields: tuple[Distinct, ...]
 
+    def renumbered(self, first: int) -> Moving:
+        """The same, its fields numbered from `first`."""
+        fields = [replace(f, spec=replace(f.spec, prefix=f"fields/{first + k}/")) for k, f in enumerate(self.fields)]
+        return Moving(tuple(replace(mover, field=first + mover.field) for mover in self.movers), tuple(fields))
+
 
 def find_movers(scene: Scene, settings: FieldSettings, cut: bool, seed: int) -> Moving:
     """The rigid objects of a scene. Raises InputError for one that no field can be made of."""
@@ -241,7 +246,7 @@ def add_points(
     return receivers, tuple(starts)
 
 
-def describe(moving: Moving, scene: Scene, starts: tuple[int, ...]) -> dict[str, Any]:
+def describe(moving: Moving, scene: Scene, starts: tuple[int, ...], first_source: int = 0) -> dict[str, Any]:
     """The attribute `fields` of the store.
 
     objects: name to the number of its field, its first receiver and their number, its placement (4, 4), own frame to
@@ -257,7 +262,7 @@ def describe(moving: Moving, scene: Scene, starts: tuple[int, ...]) -> dict[str,
         }
         for i, mover in enumerate(moving.movers)
     }
-    return {"objects": objects, "lights": {name: {"source": j} for j, name in enumerate(scene.lights)}}
+    return {"objects": objects, "lights": {name: {"source": j} for j, name in enumerate(scene.lights, first_source)}}
 
 
 def put_fields(
@@ -268,6 +273,7 @@ def put_fields(
     workers: int,
     quiet: bool,
     scheduler: str | None = None,
+    first_source: int = 0,
 ) -> None:
     """Simulates every field into the store, or takes it from the library, where it is simulated if it is not there."""
     if settings.library is None:
@@ -279,7 +285,7 @@ def put_fields(
         for field in moving.fields:
             copy_field(_from_library(field, settings, workers, quiet, scheduler), writer, field.spec.prefix)
     spacing = "geometric" if settings.spacing == "adaptive" else settings.spacing
-    for j, light in enumerate(scene.lights.values()):
+    for j, light in enumerate(scene.lights.values(), first_source):
         source = source_field(light, settings.shells, settings.resolution_of(False), settings.order, spacing)
         put_source(writer, f"sources/{j}/", source, light.radiance)
 

@@ -49,7 +49,7 @@ from relightcli.core.transport.transfer import local_rotations
 from relightcli.scene.model import Geometry, Material
 from relightcli.scene.moving import apply_moves, inverse_affine, move_geometry
 from relightcli.stages.lighting import LightingStore, Radiance, _Coats
-from relightcli.stages.placed import Mover, light_entity, read_lights, read_movers
+from relightcli.stages.placed import Mover, field_order, light_entity, read_lights, read_movers
 from relightcli.stages.placement import Placement, Sites, ball, place
 from relightcli.stages.suns import Suns
 
@@ -80,7 +80,7 @@ class MovingStore(LightingStore):
         super().__init__(store, threads)
         movers = read_movers(self.store, self.scene.materials, self.scene.objects)
         self.movers: list[Mover] = sorted(movers, key=lambda mover: mover.rows.start)
-        self.order = int(self.store.settings["fields"]["order"])
+        self.order = field_order(self.store)
         self.static = min(mover.rows.start for mover in self.movers)
         self._rest = self.geometry, self.position, self.normal
         self._now = self.scene
@@ -123,6 +123,12 @@ class MovingStore(LightingStore):
         self._now, self.position, self.normal = now, position, normal
         self._moved = self._placed = None
         return []
+
+    @property
+    def editable(self) -> set[str]:
+        """Adjustable materials whose colours may be changed: of what moves, those that its fields hold for."""
+        fixed = {mover.material for mover in self.movers if mover.kept is None}
+        return set(self.scene.materials) - fixed
 
     @property
     def geometry(self) -> Geometry:

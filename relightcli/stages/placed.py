@@ -115,9 +115,14 @@ def similarity(name: str, matrix: F64) -> tuple[F64, F64, float]:
     return linear / scale, matrix[:3, 3].copy(), scale
 
 
+def field_order(store: formats.Store) -> int:
+    """Bands of the store's fields: those chosen for a tolerance, else those asked for."""
+    return int(store.attrs["fields"].get("settings", store.settings["fields"])["order"])
+
+
 def read_movers(store: formats.Store, scene_materials: dict[str, Material], objects: dict[str, Any]) -> list[Mover]:
     """Everything that the store has fields of; objects: the scene's, by name."""
-    order = int(store.settings["fields"]["order"])
+    order = field_order(store)
     parts: dict[tuple[int, str, bool, bool], tuple[Any, ...]] = {}
     movers = []
     for name, about in store.attrs["fields"]["objects"].items():

@@ -9,7 +9,7 @@ import relight_formats as formats
 from relightcli import __version__
 from relightcli.adapters.files import need_output
 from relightcli.run import blocks as run
-from relightcli.run.accounting import Account
+from relightcli.run.accounting import Account, children_seconds
 from relightcli.scene.build import scene_to_json
 from relightcli.scene.model import Geometry
 from relightcli.stages.budget import summary
@@ -20,7 +20,8 @@ from relightcli.stages.lay_out import make_job, put_scene
 from relightcli.stages.pose_job import simulate_poses
 from relightcli.stages.precompute_config import Config
 from relightcli.stages.prepare import Prepared, prepare
-from relightcli.stages.promise import keep_promise
+from relightcli.stages.promise import keep_promise, keep_promise_moving
+from relightcli.stages.promise_moving import choose_fields
 from relightcli.stages.visibility_job import block_size, create_outputs
 
 KIND = "transfer"
@@ -30,6 +31,7 @@ WRONG_BITS = 1e-3  # share of wrong bits above which the user is told
 def precompute(config: Config) -> dict[str, Any]:
     """Runs the stage; returns a summary for the user. Raises the errors of `relightcli.errors` and OSError."""
     started, account = time.perf_counter(), Account()
+    before = time.process_time() + children_seconds()
     need_output(config.output, store=True)
     run.need_scheduler(None if config.dry_run else config.scheduler)
     prepared = prepare(config, account)
@@ -58,7 +60,7 @@ def precompute(config: Config) -> dict[str, Any]:
             {
                 "scene": scene_to_json(scene, geometry),
                 "plan": prepared.plan_rows(),
-                "tried": [{"light_resolution": r, "share": e.share, "where": e.where} for r, e in prepared.tried],
+                "tried": prepared.tried_rows(),
                 "nothing_blocks": config.effects == "auto" and not prepared.shadows,
             }
         )
@@ -80,7 +82,10 @@ def precompute(config: Config) -> dict[str, Any]:
             run.close_worker()
         if moving is not None:
             with account.step("fields"):
-                put_fields(writer, moving, scene, config.fields, config.workers, config.quiet, config.scheduler)
+                if prepared.promise is None:
+                    put_fields(writer, moving, scene, config.fields, config.workers, config.quiet, config.scheduler)
+                else:
+                    choose_fields(config, prepared.promise, scene, source, starts, writer)
         if "pose" in prepared.simulated:
             with account.step("pose"):
                 simulate_poses(
@@ -96,10 +101,13 @@ def precompute(config: Config) -> dict[str, Any]:
                     config.quiet,
                     config.scheduler,
                 )
-        if prepared.promise is not None:
+        if prepared.promise is not None and moving is not None:
+            with account.step("check"):
+                keep_promise_moving(config, prepared.promise, scene, source, writer)
+        elif prepared.promise is not None:
             with account.step("check"):
                 keep_promise(
-                    config,
+                    prepared.config,
                     prepared.promise,
                     prepared.resolution,
                     prepared.finer_helps,
@@ -111,7 +119,8 @@ def precompute(config: Config) -> dict[str, Any]:
                     writer,
                 )
         writer.commit(summary(account, started, resumed, config.workers))
-    return _summary(config, started, resumed, geometry)
+    cpu_seconds = time.process_time() + children_seconds() - before
+    return {**_summary(config, started, resumed, geometry), "cpu_seconds": cpu_seconds}
 
 
 def _settings(prepared: Prepared) -> dict[str, Any]:
@@ -127,12 +136,14 @@ def _settings(prepared: Prepared) -> dict[str, Any]:
         "seed": config.seed,
         "bounces": prepared.bounces,
     }
-    if config.pixel_grid != 1:
-        settings["pixel_grid"] = config.pixel_grid
+    if config.grid != 1:
+        settings["pixel_grid"] = config.grid
     if prepared.bounce_cells:
         settings["bounce_resolution"] = prepared.bounce_cells
     if prepared.moving is not None:
         settings["fields"] = config.fields.as_json()
+    if prepared.promise is not None:
+        settings["tolerance"] = prepared.promise
     if config.basis == "haar":
         settings |= {"coefficients": config.coefficients, "tolerance": config.tolerance}
     if "pose" in prepared.simulated:

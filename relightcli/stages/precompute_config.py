@@ -26,7 +26,7 @@ class Config:
     refine: int = 4
     effects: str = "auto"
     receivers: str = "vertices"
-    pixel_grid: int = 1
+    pixel_grid: int | None = None  # 1, or what `tolerance` takes
     subdivide: bool = True
     basis: str = "visibility"
     coefficients: int = 128
@@ -53,6 +53,11 @@ class Config:
     allow_outside: bool = False
     dry_run: bool = False
     quiet: bool = False
+
+    @property
+    def grid(self) -> int:
+        """Receivers along a pixel's side."""
+        return self.pixel_grid or 1
 
     @property
     def fields(self) -> FieldSettings:
@@ -87,9 +92,9 @@ def check_config(config: Config) -> None:
         raise InputError(f"--tolerance: expected more than 0 and less than 1; found {config.tolerance}")
     if not 1 <= config.sh_order <= 16:
         raise InputError(f"--sh-order: expected 1 to 16; found {config.sh_order}")
-    if not 1 <= config.pixel_grid <= MOST_PIXEL_GRID:
+    if config.pixel_grid is not None and not 1 <= config.pixel_grid <= MOST_PIXEL_GRID:
         raise InputError(f"--pixel-grid: expected 1 to {MOST_PIXEL_GRID}; found {config.pixel_grid}")
-    if config.pixel_grid != 1 and config.receivers == "vertices":
+    if config.grid != 1 and config.receivers == "vertices":
         raise InputError("--pixel-grid: needs --receivers pixels:CAMERA")
     check_pose_options(config.pose_frames, config.pose_order, config.pose_directions)
     if config.bounces is not None and not 0 <= config.bounces <= MOST_BOUNCES:

@@ -24,7 +24,8 @@ from relightcli.scene.parse import load_scene
 from relightcli.stages.fields import Moving, add_points, find_movers, place, without
 from relightcli.stages.inputs import named_files, stamps
 from relightcli.stages.precompute_config import RESOLUTION, Config, check_bounces, check_config
-from relightcli.stages.promise import choose, try_resolutions
+from relightcli.stages.promise import Tried, choose, try_settings
+from relightcli.stages.promise_moving import rungs
 from relightcli.stages.receiver_setup import (
     PixelReceivers,
     check_receivers,
@@ -33,8 +34,6 @@ from relightcli.stages.receiver_setup import (
     unburied,
     with_vertices,
 )
-
-MOVING = ("fields", "pose")  # effects
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ class Prepared:
     moving: Moving | None
     promise: float | None  # the error to keep
     resolution: int = RESOLUTION
-    tried: tuple[tuple[int, pilot.Share], ...] = ()  # resolutions, each with its error
+    tried: tuple[Tried, ...] = ()  # settings, each with its error
     read: dict[Path, tuple[int, int, int]] = field(default_factory=dict)  # `stamps` of the scene's files before that
 
     @property
@@ -72,7 +71,7 @@ class Prepared:
     @property
     def finer_helps(self) -> bool:
         """Whether a finer resolution of light could bring the error down, as far as was tried."""
-        return not self.tried or self.resolution == self.tried[-1][0]
+        return not self.tried or self.resolution == self.tried[-1].resolution
 
     @property
     def posed(self) -> tuple[int, ...]:
@@ -85,6 +84,15 @@ class Prepared:
     def plan_rows(self) -> list[dict[str, Any]]:
         """The plan as it is stored; what was not measured is left out."""
         return [_row(decision) for decision in self.plan]
+
+    def tried_rows(self) -> list[dict[str, Any]]:
+        """What was tried, as it is stored."""
+        grids = self.config.receivers != "vertices"
+        return [
+            {"light_resolution": t.resolution, "share": t.error.share, "where": t.error.where}
+            | ({"pixel_grid": t.grid} if grids else {})
+            for t in self.tried
+        ]
 
     def receivers(self) -> tuple[Receivers | PixelReceivers, NDArray[np.bool_] | None, tuple[int, ...]]:
         """The receivers; which of them are buried, (N,), where there are any on vertices; and the first receiver of
@@ -103,7 +111,7 @@ class Prepared:
             return vertices, np.concatenate([buried, np.zeros(len(vertices) - len(buried), bool)]), starts
         seen = geometry if config.receivers == "vertices" else self.source
         bounces = bool(self.bounce_cells)
-        asked = make_receivers(config.receivers, scene, seen, both, config.pixel_grid, fine=bounces)
+        asked = make_receivers(config.receivers, scene, seen, both, config.grid, fine=bounces)
         if isinstance(asked, PixelReceivers) and not bounces:
             return asked, None, (0,)
         vertices = on_vertices(geometry, both) if isinstance(asked, PixelReceivers) else asked
@@ -124,6 +132,8 @@ def prepare(config: Config, account: Account) -> Prepared:
     read = stamps([config.scene.absolute()])
     with account.step("reading"):
         scene = load_scene(config.scene, allow_outside=config.allow_outside)
+        if promise is not None:
+            scene = replace(scene, tolerance=promise)
         read |= stamps(named_files(scene) - read.keys())
         source = build_geometry(scene)
     motions: dict[str, str] = {o.name: o.motion for o in scene.objects.values()}
@@ -141,7 +151,7 @@ def prepare(config: Config, account: Account) -> Prepared:
             bool(both.any()),
             _lobes(scene),
             wanted,
-            scene.tolerance if promise is None else promise,
+            scene.tolerance,
             lambda: _Pilot(scene, source),
             fields.simulate or (asked is None and pose.simulate),
         )
@@ -149,19 +159,19 @@ def prepare(config: Config, account: Account) -> Prepared:
         check_bounces(config)
     plan += [pose, fields]
     simulated = [d.effect for d in plan if d.simulate]
-    if promise is not None and any(name in simulated for name in MOVING):
+    if promise is not None and "pose" in simulated:
         raise InputError(
-            f"--tolerance: {scene.path} has objects that move, and no error is promised for the light about them; "
-            "leave it out, or name effects without fields and pose"
+            f"--tolerance: {scene.path} has characters, and no error is promised for the light on their poses; leave "
+            "it out, or name effects without pose"
         )
     shadows = "shadows" in simulated
     bounce_cells = 0
     if "one-bounce" in simulated:
         coarse = (config.light_resolution or RESOLUTION) % 16
-        planned = 8 if coarse else effects.bounce_cells(plan, promise or scene.tolerance)
+        planned = 8 if coarse else effects.bounce_cells(plan, scene.tolerance)
         bounce_cells = config.bounce_resolution or planned
     with account.step("reading"):
-        moving = _moving(config, scene) if fields.simulate else None
+        moving = _moving(config, scene, promise) if fields.simulate else None
         uncut = source
         if config.subdivide and (config.receivers == "vertices" or bounce_cells):
             uncut = _subdivided(scene, source, moving, shadows)
@@ -181,12 +191,20 @@ def prepare(config: Config, account: Account) -> Prepared:
         config.light_resolution or RESOLUTION,
         read=read,
     )
-    if config.light_resolution is None and promise is not None:
-        with account.step("resolution"):
-            receivers, buried, _ = prepared.receivers()
-            tried = try_resolutions(config, scene, source, geometry, receivers, buried, promise)
-        return replace(prepared, resolution=choose(tried, promise), tried=tuple(tried))
-    return prepared
+    on_pixels = config.receivers != "vertices"
+    if promise is None or (config.light_resolution is not None and (config.pixel_grid is not None or not on_pixels)):
+        return prepared
+
+    def receivers_of(grid: int) -> tuple[Receivers | PixelReceivers, NDArray[np.bool_] | None]:
+        own = config if grid == config.grid else replace(config, pixel_grid=grid)
+        return replace(prepared, config=own).receivers()[:2]
+
+    with account.step("resolution"):
+        tried = try_settings(config, scene, source, geometry, receivers_of, promise)
+    chosen = choose(tried, promise)
+    if on_pixels:
+        config = replace(config, pixel_grid=chosen.grid)
+    return replace(prepared, config=config, resolution=chosen.resolution, tried=tuple(tried))
 
 
 class _Pilot:
@@ -211,12 +229,13 @@ def _row(decision: effects.Decision) -> dict[str, Any]:
     return row | {key: value for key, value in measured.items() if value is not None and math.isfinite(value)}
 
 
-def _moving(config: Config, scene: Scene) -> Moving:
+def _moving(config: Config, scene: Scene, promise: float | None) -> Moving:
     """What may be moved. Raises InputError where receivers or settings do not go with it."""
     config.fields.check()
     if config.receivers != "vertices":
         raise InputError("--receivers: objects that move carry their light at vertices; expected vertices")
-    return find_movers(scene, config.fields, config.subdivide, config.seed)
+    first = config.fields if promise is None else rungs(config.fields)[0]
+    return find_movers(scene, first, config.subdivide, config.seed)
 
 
 def _subdivided(scene: Scene, geometry: Geometry, moving: Moving | None, shadows: bool) -> Geometry:

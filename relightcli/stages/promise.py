@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -14,6 +15,7 @@ from relightcli.adapters.rays import Tracer
 from relightcli.core.transport.receivers import receivers_of_vertices
 from relightcli.errors import NumericalError
 from relightcli.plan import pilot
+from relightcli.run.accounting import Meter
 from relightcli.scene.model import Camera, Geometry, Scene
 from relightcli.stages.lighting import LightingStore
 from relightcli.stages.measured_error import (
@@ -25,11 +27,13 @@ from relightcli.stages.measured_error import (
     Strips,
     check_skies,
     check_views,
+    edit_of,
     pixel_strips,
     rows_of,
     trial,
     vertex_strips,
 )
+from relightcli.stages.promise_moving import check_moved
 from relightcli.stages.receiver_setup import MOST_PIXEL_GRID, PixelReceivers
 
 if TYPE_CHECKING:
@@ -37,6 +41,8 @@ if TYPE_CHECKING:
     from relightcli.stages.precompute_config import Config
 
 RESOLUTIONS = (16, 32, 64, 128)  # to choose from
+GRIDS = (1, 2, MOST_PIXEL_GRID)  # of receivers along a pixel's side, to choose from
+Receiving = Callable[[int], "tuple[Receivers | PixelReceivers, NDArray[np.bool_] | None]"]  # by grid of pixels
 DIRECT = 0.8  # of the tolerance: what direct light may be off by; the square of the rest is for what is left out
 
 
@@ -60,54 +66,105 @@ def _camera_of(config: Config) -> str | None:
     return None if config.receivers == "vertices" else config.receivers.partition(":")[2]
 
 
-def try_resolutions(
+@dataclass(frozen=True)
+class Tried:
+    """A resolution of light and, of receivers on pixels, their grid; and the error of direct light with them."""
+
+    resolution: int
+    grid: int
+    error: pilot.Share
+
+
+def try_settings(
+    config: Config, scene: Scene, source: Geometry, geometry: Geometry, receivers_of: Receiving, promise: float
+) -> list[Tried]:
+    """Errors of direct light by grid of pixels and resolution, up to what will do, in the pilot's views and skies.
+    What was asked for is all that is tried of it."""
+    resolutions = [r for r in RESOLUTIONS if config.refine * 4 <= r]
+    if config.light_resolution is not None:
+        resolutions = [config.light_resolution]
+    grids = GRIDS if config.pixel_grid is None and _camera_of(config) else (config.grid,)
+    judge = Judge(scene, source, Tracer(source.positions, source.faces))
+    out: list[Tried] = []
+    for grid in grids:
+        receivers, buried = receivers_of(grid)
+        found = _try_resolutions(config, judge, geometry, receivers, buried, resolutions, DIRECT * promise)
+        out += [Tried(resolution, grid, error) for resolution, error in found]
+        if out[-1].error.share <= DIRECT * promise:
+            break
+    return out
+
+
+def _try_resolutions(
     config: Config,
-    scene: Scene,
-    source: Geometry,
+    judge: Judge,
     geometry: Geometry,
     receivers: Receivers | PixelReceivers,
     buried: NDArray[np.bool_] | None,
-    promise: float,
+    resolutions: Sequence[int],
+    most: float,
 ) -> list[tuple[int, pilot.Share]]:
-    """Errors of direct light by resolution, up to the one that will do, in the pilot's views and skies."""
-    only = _camera_of(config)
+    only, scene, source = _camera_of(config), judge.scene, judge.geometry
     cameras = [scene.cameras[only]] if only else list(scene.cameras.values())[: pilot.MOST_VIEWS]
     if not cameras:
         cameras = check_views(scene, source, None)
     points = receivers.points if isinstance(receivers, PixelReceivers) else receivers
     return trial(
-        Judge(scene, source, Tracer(source.positions, source.faces)),
+        judge,
         geometry,
         points,
         np.zeros(len(points), bool) if buried is None else buried,
         _strips(scene, geometry, receivers, buried, cameras),
-        [r for r in RESOLUTIONS if config.refine * 4 <= r],
+        resolutions,
         config.refine,
         {name: sky.radiance for name, sky in pilot.skies(False)},
-        DIRECT * promise,
+        most,
         config.seed,
     )
 
 
-def choose(tried: list[tuple[int, pilot.Share]], promise: float) -> int:
-    """The coarsest resolution whose direct light is near enough; where none is, the coarsest that is as good as any:
-    what is wrong then does not come from the resolution, and a finer one would only cost."""
-    least = min(share.share for _, share in tried)
+def choose(tried: list[Tried], promise: float) -> Tried:
+    """The coarsest settings whose direct light is near enough; where none is, the coarsest that are as good as any:
+    what is wrong then does not come from them, and finer ones would only cost."""
+    least = min(one.error.share for one in tried)
     most = max(DIRECT * promise, (1.0 + GAIN) * least)
-    return next(resolution for resolution, share in tried if share.share <= most)
+    return next(one for one in tried if one.error.share <= most)
 
 
-def predict_check(config: Config, scene: Scene, source: Geometry, bounces: int) -> float:
-    """Seconds that `keep_promise` will trace, from a few rows of one of its pictures."""
+def predict_check(config: Config, scene: Scene, source: Geometry, bounces: int) -> dict[str, float]:
+    """seconds and cpu_seconds that `keep_promise` will trace, from a few rows of one of its pictures."""
     judge = Judge(scene, source, Tracer(source.positions, source.faces))
     cameras, skies = check_views(scene, source, _camera_of(config)), check_skies()
     middle = cameras[0].size[1] // 2
     rows = (max(0, middle - STRIP // 2), middle + max(1, STRIP // 2))
-    clock = time.perf_counter()
+    meter = Meter()
     judge.trace(Strips(cameras[0], [rows], []), next(iter(skies.values())), scene.materials, bounces + MORE, 0)
-    taken = time.perf_counter() - clock
+    taken = meter.read()
     pixels = sum(sum(b - a for a, b in rows_of(c)) * c.size[0] for c in cameras)
-    return 2 * len(skies) * taken * pixels / ((rows[1] - rows[0]) * cameras[0].size[0])
+    times = 2 * len(skies) * pixels / ((rows[1] - rows[0]) * cameras[0].size[0])
+    return {key: times * taken[key] for key in ("seconds", "cpu_seconds")}
+
+
+def keep_promise_moving(config: Config, promise: float, scene: Scene, source: Geometry, writer: formats.Writer) -> None:
+    """`keep_promise` where objects may be moved."""
+    found = check_moved(config, promise, scene, source, writer)
+    _keep(writer, found, promise)
+    if found.share <= promise or config.allow_miss:
+        return
+    order = 1 + int(writer.attrs["fields"]["settings"]["order"])
+    raise NumericalError(
+        f"{config.output}: the error is {found.share:.2%} ({found.where}), more than the tolerance of {promise:.2%}. "
+        f"What would help: --field-order {order}, as which shadows of what moves are sharp, or a finer mesh. The work "
+        f"is kept in {writer.partial_path.name}; the same command with --allow-miss finishes it as it is"
+    )
+
+
+def _keep(writer: formats.Writer, found: pilot.Share, promise: float) -> None:
+    """The error that was found, into the store."""
+    measured: dict[str, Any] = {"share": found.share, "where": found.where}
+    if math.isfinite(found.bound):  # else the two runs do not tell
+        measured["bound"] = found.bound
+    writer.set_attrs({"measured_error": {**measured, "tolerance": promise}})
 
 
 def keep_promise(
@@ -131,14 +188,12 @@ def keep_promise(
     strips = _strips(scene, geometry, receivers, buried, check_views(scene, source, _camera_of(config)))
     skies = check_skies()
     bounces = lighting.bounces
-    found = judge.error(lighting, strips, skies, bounces, bounces + MORE, edits=True)
-    measured: dict[str, Any] = {"share": found.share, "where": found.where}
-    if math.isfinite(found.bound):  # else the two runs do not tell
-        measured["bound"] = found.bound
-    writer.set_attrs({"measured_error": {**measured, "tolerance": promise}})
+    edit = edit_of(scene.materials, set(scene.materials))
+    found = judge.error(lighting, strips, skies, bounces, bounces + MORE, edit, promise)
+    _keep(writer, found, promise)
     if found.share <= promise or config.allow_miss:
         return
-    direct = judge.error(lighting, strips, skies, 0, 0, edits=False)
+    direct = judge.error(lighting, strips, skies, 0, 0, None, DIRECT * promise)
     if direct.share <= DIRECT * promise:
         knob = f"--bounces {bounces + 1} or a finer --bounce-resolution"
     elif config.receivers == "vertices":
@@ -146,8 +201,9 @@ def keep_promise(
     elif resolution < RESOLUTIONS[-1] and finer_helps:
         knob = f"--light-resolution {2 * resolution}"
     else:
-        grid = min(config.pixel_grid + 1, MOST_PIXEL_GRID)
-        knob = f"--pixel-grid {grid}" + (f" or --light-resolution {2 * resolution}" if finer_helps else "")
+        grid = config.grid + 1
+        finer = f"--pixel-grid {grid}" if grid <= MOST_PIXEL_GRID else "a larger picture"
+        knob = finer + (f" or --light-resolution {2 * resolution}" if finer_helps else "")
     raise NumericalError(
         f"{config.output}: the error is {found.share:.2%} ({found.where}; of direct light {direct.share:.2%}), more "
         f"than the tolerance of {promise:.2%}. What would help: {knob}. The work is kept in "

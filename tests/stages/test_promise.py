@@ -43,14 +43,17 @@ def run(scene, output, **settings):
     return precompute(Config(scene, output, quiet=True, **{"workers": 1, "subdivide": False, **settings}))
 
 
-def true_error(store, name, sky):
-    """Relative RMS of the picture of a sky against path tracing of all bounces, its noise taken off by two runs."""
+def true_error(store, name, sky, transfer=None):
+    """Relative RMS of the picture of a sky against path tracing of all bounces, its noise taken off by two runs.
+
+    transfer: the store whose scene is traced, if `store` does not hold it."""
     write_image(store.parent / f"{name}.exr", sky)
-    given = {"store": store, "env": str(store.parent / f"{name}.exr"), "quiet": True, "workers": 1}
+    given = {"env": str(store.parent / f"{name}.exr"), "quiet": True, "workers": 1}
     out = [store.parent / f"{name}-{k}.exr" for k in ("ours", "a", "b")]
-    relight(RelightConfig(output=str(out[0]), **given))
+    relight(RelightConfig(store=store, output=str(out[0]), **given))
     for seed, path in enumerate(out[1:]):
-        relight(RelightConfig(output=str(path), reference=True, spp=128, bounces=8, seed=seed, **given))
+        truth = {"store": transfer or store, "reference": True, "spp": 128, "bounces": 8, "seed": seed}
+        relight(RelightConfig(output=str(path), **truth, **given))
     s, a, b = (read_layers(path)[""].astype(float) for path in out)
     return np.sqrt(max(((s - a) * (s - b)).sum(), 0.0) / (a * b).sum())
 
