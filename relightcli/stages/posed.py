@@ -114,10 +114,12 @@ class PoseStore(LightingStore):
         return self._objects[name]
 
     def buried(self) -> NDArray[np.bool_]:
-        """See `LightingStore.buried`. Of posed objects nothing is known to be."""
+        """See `LightingStore.buried`; of posed objects in the pose they are in, if anything blocks anything."""
         buried = super().buried().copy()
         for name in self._posed:
             buried[self._objects[name].receivers] = False
+        if self._scene is not None:
+            buried[self._scene.of_posed] = self._scene.buried
         return buried
 
     # -- who sees what
