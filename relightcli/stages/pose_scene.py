@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from relightcli.adapters.rays import Tracer
 from relightcli.core.fields.dimmed import may_block
 from relightcli.core.pose.beside import CELLS
+from relightcli.core.shade.primary import face_normals
 from relightcli.core.transport.blockers import Balls, block, bounding_balls
+from relightcli.core.transport.buried import find_buried, shortest_edges
 from relightcli.core.transport.hits import Surfaces, trace_hits
 from relightcli.core.transport.light_visibility import light_bits
 from relightcli.core.transport.local_lights import LocalLights
@@ -65,6 +67,16 @@ class PosedScene:
     @cached_property
     def everything(self) -> Tracer:
         return Tracer(self.geometry.positions, self.faces)
+
+    @cached_property
+    def buried(self) -> NDArray[np.bool_]:
+        """Which of the posed receivers are inside their own body or another, where skins meet: pictures and rays take
+        no light from them."""
+        geometry, store, rows = self.geometry, self.store, self.of_posed
+        assert store.vertex is not None
+        reach = shortest_edges(geometry.positions, self.faces)[store.vertex[rows]]
+        normals, two_sided = face_normals(geometry.positions, self.faces), geometry.two_sided[self.owner]
+        return find_buried(self.everything, store.position[rows], store.normal[rows], reach, normals, two_sided)
 
     # -- the sky
 

@@ -114,10 +114,12 @@ class PoseStore(LightingStore):
         return self._objects[name]
 
     def buried(self) -> NDArray[np.bool_]:
-        """See `LightingStore.buried`. Of posed objects nothing is known to be."""
+        """See `LightingStore.buried`; of posed objects in the pose they are in, if anything blocks anything."""
         buried = super().buried().copy()
         for name in self._posed:
             buried[self._objects[name].receivers] = False
+        if self._scene is not None:
+            buried[self._scene.of_posed] = self._scene.buried
         return buried
 
     # -- who sees what
@@ -191,7 +193,9 @@ class PoseStore(LightingStore):
         for name, state in self._posed.items():
             item = self._objects[name]
             for side in item.sides:
-                out[side.receivers] = self._diffuse(item, state, side, sky)[side.vertices]
+                own = side if active is None else _part(side, active[side.receivers])
+                if len(own.vertices):
+                    out[own.receivers] = self._diffuse(item, state, own, sky)
         return out
 
     def _take_off(self, sky: SkyCube, out: F32) -> None:
@@ -203,24 +207,25 @@ class PoseStore(LightingStore):
         out[rows] *= np.clip(left / np.maximum(was, np.float32(1e-30)), 0.0, 1.0)
 
     def _diffuse(self, item: PosedObject, state: PosedState, side: Side, sky: SkyCube) -> F32:
-        """Irradiance (V, 3) of one side of a posed object's vertices."""
+        """Irradiance (N, 3) at the vertices of a side."""
         order, model = item.order, side.model
         cosine = item.weight == "cosine"
         frames = state.facing(side)[1]
         normals = np.ascontiguousarray(frames[:, 2])
-        first = np.zeros(len(normals), np.int32)
+        kernel = np.full(len(normals), -1, np.int32)
+        kernel[side.vertices] = 0
         # A cosine-weighted model is lit by the light itself: kappa_0 = 4 makes l . v / pi of it.
         kappa = np.array([4.0]) if cosine else phong_factors(DIFFUSE, 2 * order - 1)
         cells = self._open_cells(item, state, side)
         if cells is None:
             light = _light(sky, len(kappa), order)
             lights = [lighting(kappa, light, order)]
-            e = shade(model, state.scores, frames, normals, first, lights, self.threads)
+            e = shade(model, state.scores, frames, normals, kernel, lights, self.threads)
         else:
             seen = visibility(model, state.scores, frames)
             profile = band_profile(kappa) if cosine else lambert_profile()
-            e = shade_beside(seen, cells, sky_cells(sky, order), normals, first, [profile], self.threads)
-        return np.float32(math.pi) * e
+            e = shade_beside(seen, cells, sky_cells(sky, order), normals, kernel, [profile], self.threads)
+        return np.float32(math.pi) * e[side.vertices]
 
     def _exact_specular(
         self,

@@ -157,6 +157,27 @@ def test_no_light_comes_through_walls(tmp_path):
     assert np.abs(radiance(store, "dark.zarr")[bar]).max() == 0
 
 
+BLOCK = """v -1 -1 -1\nv 1 -1 -1\nv 1 0.7 -1\nv -1 0.7 -1\nv -1 -1 1\nv 1 -1 1\nv 1 0.7 1\nv -1 0.7 1
+f 1 3 2\nf 1 4 3\nf 5 6 7\nf 5 7 8\nf 1 6 5\nf 1 2 6\nf 4 8 7\nf 4 7 3\nf 1 5 8\nf 1 8 4\nf 2 3 7\nf 2 7 6
+"""
+
+
+def test_vertices_inside_others_darken_nothing(tmp_path):
+    """The bar stands in a black block up to its second row of vertices, which see nothing: what comes out of the block
+    is lit as its upper vertices are, not as a mean of those and black. Relative RMS of the bar, whose lowest part is
+    lit as one: 0.089 when this was written, and 0.21 with all vertices."""
+    scene = make_scene(tmp_path, SCENE.replace("[materials.grey]", "[materials.grey]\ndiffuse = [0, 0, 0]"))
+    (tmp_path / "floor.obj").write_text(BLOCK)
+    store = fit(make_store(scene, **MADE, bounces=0))
+    opened = PoseStore(store, 1)
+    opened.set_poses((POSE,))
+    bar = opened.object == 0
+    assert np.array_equal(opened.buried()[bar], opened.position[bar, 1] < 0.7)
+    ours = read_layers(render(store, "ours.exr"))[""]
+    truth = read_layers(render(scene, "truth.exr", reference=True, spp=64))[""]
+    assert relative_rmse(ours, truth) < 0.12
+
+
 TWO = SCENE.replace("[objects.floor]", '[objects.second]\nmesh = "bar.glb"\nmaterial = "red"\nmotion = "skinned"\n'
                     "translate = [-1.2, 0.1, 0]\n[objects.floor]")  # fmt: skip
 

@@ -46,7 +46,7 @@ def unbury(
 
     positions (V, 3), faces (F, 3); face_normals (F, 3) of the counter-clockwise sides; two_sided (F,).
     """
-    reach = _shortest_edges(positions, faces)[receivers.vertex]
+    reach = shortest_edges(positions, faces)[receivers.vertex]
     place = receivers.position.copy()
     touching = _touching(tracer, place, receivers.normal, reach)
     # Corners of faces by vertex: vertex v's are corner[first[v]] to corner[first[v + 1]].
@@ -149,7 +149,7 @@ def _directions(normals: Any, first: int, last: int) -> Any:
     return out
 
 
-def _shortest_edges(positions: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
+def shortest_edges(positions: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.float64]:
     """Length of the shortest edge at every vertex, (V,); infinite where there are none."""
     out = np.full(len(positions), np.inf)
     for a, b in ((0, 1), (1, 2), (2, 0)):
