@@ -34,6 +34,7 @@ NAMES = (
     "clusters",
     "pose",
     "fields",
+    "planner",
     "promise",
     "field_stores",
     "moving",
