@@ -28,6 +28,7 @@ LONG = (
     "clusters",
     "pose",
     "fields",
+    "planner",
     "promise",
     "field_stores",
     "moving",

@@ -60,7 +60,7 @@ def dry_run(prepared: Prepared, account: Account) -> dict[str, Any]:
         sum(cost[key] for cost in account.steps.values()) + start[key] for key in ("seconds", "cpu_seconds")
     )
     if prepared.promise is not None:
-        check = predict_check(config, prepared.scene, prepared.source, prepared.bounces)
+        check = predict_check(config, prepared.scene, prepared.source, prepared.bounces, prepared.tried)
         seconds += check["seconds"]
         cpu_seconds += check["cpu_seconds"]
     total = np.sum(list(spent.values()), axis=0)

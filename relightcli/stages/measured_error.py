@@ -28,6 +28,7 @@ from relightcli.core.transport.path_tracer import trace_rows
 from relightcli.core.transport.receivers import Receivers, receivers_of_vertices
 from relightcli.core.transport.shading import shading_scene
 from relightcli.plan.pilot import NOTHING, Share, larger, share_of, views
+from relightcli.run.accounting import Meter
 from relightcli.scene.model import Camera, Geometry, Material, Scene
 from relightcli.stages.lighting import LightingStore, together
 
@@ -254,12 +255,14 @@ class _Run:
 
 @dataclass(frozen=True)
 class Judge:
-    """The path tracer on the scene as it is, before faces were cut. traced: what it has found, to be asked again."""
+    """The path tracer on the scene as it is, before faces were cut. traced: what it has found, to be asked again; lit:
+    what each picture's light took that was held against it (`run.accounting.Meter`)."""
 
     scene: Scene
     geometry: Geometry
     tracer: Tracer
     traced: dict[tuple[Camera, str, int, int, int], _Run] = field(default_factory=dict)
+    lit: list[dict[str, float]] = field(default_factory=list)
 
     def error(
         self,
@@ -285,7 +288,9 @@ class Judge:
             active = view.used(len(lighting))
             for number, (name, sky) in enumerate(skies.items()):
                 materials = changes[number % len(changes)]
+                meter = Meter()
                 light = together(lighting.exit_radiance(sky, 0.0, materials, towards, active, None, bounces))
+                self.lit.append(meter.read())
                 ours = view.pixels(light.diffuse, light.specular)
                 where = f"camera {view.camera.name}, {name}{', edited' if number % len(changes) else ''}"
                 keys = [(view.camera, name, number % len(changes), truth, run) for run in (seed, seed + 1)]

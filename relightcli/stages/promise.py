@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from statistics import mean, median
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -68,11 +69,14 @@ def _camera_of(config: Config) -> str | None:
 
 @dataclass(frozen=True)
 class Tried:
-    """A resolution of light and, of receivers on pixels, their grid; and the error of direct light with them."""
+    """A resolution of light and, of receivers on pixels, their grid; the error of direct light with them; the seconds
+    and cpu_seconds that the light of a picture takes; passes of path tracing that it took to tell, in the mean."""
 
     resolution: int
     grid: int
     error: pilot.Share
+    lit: dict[str, float]
+    passes: float
 
 
 def try_settings(
@@ -88,8 +92,11 @@ def try_settings(
     out: list[Tried] = []
     for grid in grids:
         receivers, buried = receivers_of(grid)
+        judge.lit.clear()
         found = _try_resolutions(config, judge, geometry, receivers, buried, resolutions, DIRECT * promise)
-        out += [Tried(resolution, grid, error) for resolution, error in found]
+        lit = {key: median(one[key] for one in judge.lit) for key in ("seconds", "cpu_seconds")}
+        passes = mean(run.passes for run in judge.traced.values())
+        out += [Tried(resolution, grid, error, lit, passes) for resolution, error in found]
         if out[-1].error.share <= DIRECT * promise:
             break
     return out
@@ -131,8 +138,11 @@ def choose(tried: list[Tried], promise: float) -> Tried:
     return next(one for one in tried if one.error.share <= most)
 
 
-def predict_check(config: Config, scene: Scene, source: Geometry, bounces: int) -> dict[str, float]:
-    """seconds and cpu_seconds that `keep_promise` will trace, from a few rows of one of its pictures."""
+def predict_check(
+    config: Config, scene: Scene, source: Geometry, bounces: int, tried: Sequence[Tried]
+) -> dict[str, float]:
+    """seconds and cpu_seconds that `keep_promise` will take: to trace, from a few rows of one of its pictures, as
+    often as it took for what was tried; for light, from the direct light of that."""
     judge = Judge(scene, source, Tracer(source.positions, source.faces))
     cameras, skies = check_views(scene, source, _camera_of(config)), check_skies()
     middle = cameras[0].size[1] // 2
@@ -142,7 +152,11 @@ def predict_check(config: Config, scene: Scene, source: Geometry, bounces: int) 
     taken = meter.read()
     pixels = sum(sum(b - a for a, b in rows_of(c)) * c.size[0] for c in cameras)
     times = 2 * len(skies) * pixels / ((rows[1] - rows[0]) * cameras[0].size[0])
-    return {key: times * taken[key] for key in ("seconds", "cpu_seconds")}
+    pictures = len(skies) * len(cameras)
+    light = tried[-1].lit if tried else {"seconds": 0.0, "cpu_seconds": 0.0}
+    if tried:
+        times *= tried[-1].passes
+    return {key: times * taken[key] + pictures * light[key] for key in ("seconds", "cpu_seconds")}
 
 
 def keep_promise_moving(config: Config, promise: float, scene: Scene, source: Geometry, writer: formats.Writer) -> None:
