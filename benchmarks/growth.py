@@ -37,7 +37,7 @@ Point = tuple[float, ...]
 
 
 def measure(setting: Setting) -> Report:
-    report = Report("growth: a knot on a ground, R = 16 over vertices, else 10,000 vertices")
+    report = Report("a knot on a ground, R = 16 over vertices, else 10,000 vertices")
     few, middle = (500, 1_000) if setting.quick else (10_000, 100_000)
     sizes = (few, middle, 2_000) if setting.quick else (few, 30_000, middle, 300_000, 1_000_000)
     over_vertices, lights = [], []
