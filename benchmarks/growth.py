@@ -1,11 +1,10 @@
-"""Time, memory and bytes of precompute as scenes grow: points over one size, and the exponent that fits them.
+"""Time, memory and bytes as scenes grow: points over one size at a time, and the exponent that fits them.
 
 Every point is a process of its own. CPU seconds are of all its processes, the peak is that of the largest one.
 """
 
 from __future__ import annotations
 
-import math
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,41 +13,62 @@ from resource import RUSAGE_CHILDREN, getrusage
 import numpy as np
 
 from benchmarks.processes import run_tool
-from benchmarks.report import Report, Row, Table
-from benchmarks.scenes import Setting, write_scene
+from benchmarks.report import Report, Table, at_most
+from benchmarks.scenes import Setting, two_skies, write_scene
 
 MOST_PEAK = 3.0  # GB a process, at a million vertices
 SHADOWS = ("--no-subdivide", "--effects", "direct,shadows", "--light-resolution")
+BOUNCED = ("--no-subdivide", "--light-resolution", "16", "--bounces", "1", "--bounce-resolution")
+LIGHTS = ("--light-resolution", "64", "--lights", "250")
 HEAD = ("receivers", "s", "CPU s", "peak GB", "MB")
+FRAMES = """\
+format = 1
+frames = {frames}
+
+[[key]]
+frame = 1
+env_rotate = 0
+
+[[key]]
+frame = {frames}
+env_rotate = 350
+"""
+Point = tuple[float, ...]
 
 
 def measure(setting: Setting) -> Report:
-    report = Report("growth of precompute: a knot on a ground, R = 16 over vertices, else 10,000 vertices")
-    few = 1_000 if setting.quick else 10_000
-    sizes = (500, 1_000, 2_000) if setting.quick else (10_000, 30_000, 100_000, 300_000, 1_000_000)
-    over_vertices = [_point(setting, n, (*SHADOWS, "16")) for n in sizes]
-    _add(report, "vertices", sizes, over_vertices)
-    resolutions = (16, 32) if setting.quick else (16, 32, 64, 128)
-    _add(report, "texels along a face", resolutions, [_point(setting, few, (*SHADOWS, str(r))) for r in resolutions])
-    bounced = ("--no-subdivide", "--light-resolution", "16", "--bounce-resolution")
-    cells = (8, 16)
+    report = Report("a knot on a ground, R = 16 over vertices, else 10,000 vertices")
+    few, middle = (500, 1_000) if setting.quick else (10_000, 100_000)
+    sizes = (few, middle, 2_000) if setting.quick else (few, 30_000, middle, 300_000, 1_000_000)
+    over_vertices, lights = [], []
+    for n in sizes:
+        over_vertices.append(_simulate(setting, n, (*SHADOWS, "16")))
+        if n in (few, middle, sizes[-1]):
+            lights.append(_cluster(setting))
+        if n == few:
+            counts = (2, 4) if setting.quick else (8, 32, 128)
+            frames = [_pictures(setting, count) for count in counts]
+    _add(report, "precompute over vertices", "vertices", sizes, over_vertices)
+    _add(report, "cluster --lights 250 over vertices", "vertices", (few, middle, sizes[-1]), lights)
+    _add(report, "relight over frames", "frames", counts, frames)
+    more = (few, middle) if setting.quick else (few, 30_000, middle)
     _add(
         report,
-        "cells along a face of what is seen, one interreflection",
-        cells,
-        [_point(setting, few, (*bounced, str(c), "--bounces", "1")) for c in cells],
+        "precompute with one interreflection over vertices",
+        "vertices",
+        more,
+        [_simulate(setting, n, (*BOUNCED, "16")) for n in more],
     )
-    peak = over_vertices[-1][3]
-    report.rows.append(
-        Row(
-            f"peak of a process at {sizes[-1]:,} vertices",
-            peak,
-            "GB",
-            ratio=MOST_PEAK / peak,
-            target=f"<= {MOST_PEAK:g} GB",
-            met=peak <= MOST_PEAK,
+    resolutions = (16, 32) if setting.quick else (16, 32, 64, 128)
+    points = [_simulate(setting, few, (*SHADOWS, str(r))) for r in resolutions]
+    _add(report, "precompute over texels along a face", "texels", resolutions, points)
+    cells = (8, 16)
+    points = [_simulate(setting, few, (*BOUNCED, str(c))) for c in cells]
+    _add(report, "precompute with one interreflection over cells along a face of what is seen", "cells", cells, points)
+    for what, found in (("precompute", over_vertices), ("cluster of lights", lights)):
+        report.rows.append(
+            at_most(f"{what}: peak of a process at {sizes[-1]:,} vertices", found[-1][3], "GB", MOST_PEAK)
         )
-    )
     return report
 
 
@@ -57,13 +77,35 @@ def exponent(sizes: Sequence[float], values: Sequence[float]) -> float:
     return float(np.polyfit(np.log(sizes), np.log(np.maximum(values, 1e-9)), 1)[0])
 
 
-def _point(setting: Setting, vertices: int, options: tuple[str, ...]) -> tuple[float, ...]:
+def _simulate(setting: Setting, vertices: int, options: tuple[str, ...]) -> Point:
     scene, _ = write_scene(setting, vertices)
     store = setting.work / "growth.zarr"
     shutil.rmtree(store, ignore_errors=True)
+    return _run(store, "precompute", scene, "-o", store, *options)
+
+
+def _cluster(setting: Setting) -> Point:
+    """Of the store that `_simulate` has left."""
+    store = setting.work / "growth-lights.zarr"
+    shutil.rmtree(store, ignore_errors=True)
+    return _run(store, "cluster", setting.work / "growth.zarr", "-o", store, *LIGHTS)
+
+
+def _pictures(setting: Setting, frames: int) -> Point:
+    """Of the store that `_simulate` has left, under a sky that turns; no receivers to count."""
+    shots, folder = setting.work / "growth.toml", setting.work / "growth-frames"
+    shots.write_text(FRAMES.format(frames=frames))
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    sky = next(iter(two_skies(setting).values()))
+    where = ("--env", sky, "--camera", "main", "--frames", shots, "-o", folder / "frame.####.exr")
+    return _run(folder, "relight", setting.work / "growth.zarr", *where)
+
+
+def _run(made: Path, *arguments: str | Path) -> Point:
     before = _cpu()
-    finished, said = run_tool("precompute", scene, "-o", store, *options)
-    return said["receivers"], finished.seconds, _cpu() - before, finished.peak_bytes / 1e9, _size(store) / 1e6
+    finished, said = run_tool(*arguments)
+    return said.get("receivers", 0), finished.seconds, _cpu() - before, finished.peak_bytes / 1e9, _size(made) / 1e6
 
 
 def _cpu() -> float:
@@ -75,14 +117,12 @@ def _size(store: Path) -> int:
     return sum(file.stat().st_size for file in store.rglob("*") if file.is_file())
 
 
-def _add(report: Report, what: str, sizes: Sequence[int], points: list[tuple[float, ...]]) -> None:
-    """The points, and below them the exponent of each column between the first point and the last."""
-    rows: list[tuple[str | int | float, ...]] = [(n, int(p[0]), *p[1:]) for n, p in zip(sizes, points, strict=True)]
-    fitted = [exponent(sizes, column) for column in zip(*points, strict=True)]
-    last = [
-        math.log(points[-1][k] / points[-2][k]) / math.log(sizes[-1] / sizes[-2]) if points[-2][k] else math.nan
-        for k in range(len(points[0]))
+def _add(report: Report, about: str, what: str, sizes: Sequence[int], points: list[Point]) -> None:
+    """The points, and below them the exponent of each column over all points, and between the last two."""
+    rows: list[tuple[str | int | float, ...]] = [
+        (n, int(p[0]) or "", *p[1:]) for n, p in zip(sizes, points, strict=True)
     ]
-    rows.append(("exponent, all points", *(f"{p:.2f}" for p in fitted)))
-    rows.append(("exponent, last two", *(f"{p:.2f}" for p in last)))
-    report.tables.append(Table(f"over {what}", (what, *HEAD), tuple(rows)))
+    for title, first in (("exponent, all points", 0), ("exponent, last two", -2)):
+        columns = zip(*points[first:], strict=True)
+        rows.append((title, *(f"{exponent(sizes[first:], c):.2f}" if all(c) else "" for c in columns)))
+    report.tables.append(Table(about, (what, *HEAD), tuple(rows)))
