@@ -43,6 +43,7 @@ EXCUSED: dict[str, str] = {
     "pose/beside.py": _SUMS,
     "pose/frames.py": _WHOLE,
     "pose/pose_model.py": "lobes, scores and regressions of its neighbours",
+    "shade/backdrop.py": _SUMS,
     "shade/bounces.py": _SUMS,
     "shade/bright.py": _SUMS,
     "shade/cluster_sum.py": _SUMS,

@@ -45,6 +45,7 @@ class Config:
     light_rank: int = 64
     second_order: int = 0
     coefficients: int = KEEP
+    brdf_ranks: tuple[int, int, int] | None = None
     workers: int = 1
     overwrite: bool = False
     dry_run: bool = False
@@ -77,6 +78,8 @@ def factorize(config: Config) -> dict[str, Any]:
     clusters = int(label.max()) + 1
     if config.dry_run:
         return {"dry_run": True, "receivers": len(lighting), "clusters": clusters, "notes": []}
+    if config.brdf_ranks is not None:
+        settings["brdf_ranks"] = list(config.brdf_ranks)
     writer = formats.begin(
         config.output,
         KIND,
@@ -105,7 +108,7 @@ def factorize(config: Config) -> dict[str, Any]:
         writer.put("one_bounce/basis", basis, dims=("light_cell", "light"))
         bands = int(store.settings["order"])
         with account.step("direct"):
-            put_direct(writer, lighting, config.coefficients, config.workers)
+            put_direct(writer, lighting, config.coefficients, config.workers, config.brdf_ranks)
         if bounces:
             with account.step("one-bounce"):
                 _one_bounce(config, writer, setup, basis, order, start, bands)
