@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from relightcli.core.lights.latlong import LatLong, lookup, texel_of
 from relightcli.core.transport.camera import Film, film_direction
 
-FINE = 8
+FINE = 4
 
 
 def backdrop(environment: LatLong, film: Film, threads: int = 1) -> NDArray[np.float32]:
