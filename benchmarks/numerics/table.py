@@ -45,6 +45,7 @@ EXCUSED: dict[str, str] = {
     "pose/frames.py": _WHOLE,
     "pose/pose_model.py": "lobes, scores and regressions of its neighbours",
     "pose/seen.py": _METHOD,
+    "shade/backdrop.py": _SUMS,
     "shade/bounces.py": _SUMS,
     "shade/bright.py": _SUMS,
     "shade/cluster_sum.py": _SUMS,

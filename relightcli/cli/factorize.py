@@ -10,6 +10,18 @@ import click
 from relightcli.cli import options
 
 
+def _ranks(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[int, int, int] | None:
+    if value is None:
+        return None
+    try:
+        h, o, i = (int(part) for part in value.split(","))
+    except ValueError:
+        h = o = i = 0
+    if min(h, o, i) < 1:
+        raise click.BadParameter(f"expected three whole numbers from 1 on, as in 8,16,8; found {value!r}")
+    return h, o, i
+
+
 @click.command(name="factorize")
 @click.argument("store", type=options.store_path)
 @options.output("Asset to make, e.g. asset.zarr.")
@@ -46,6 +58,14 @@ from relightcli.cli import options
     help="Relative RMS error of radiance to keep, all stages together. Default: that of the store, if it has one.",
 )
 @click.option("--allow-miss", is_flag=True, help="Keep the asset where its error is larger than the tolerance.")
+@click.option(
+    "--brdf-ranks",
+    default=None,
+    callback=_ranks,
+    metavar="H,O,I",
+    help="Ranks of the tensors of BRDFs: reflectance, view, light. Default: 8,16,8 for cook-torrance, 6,16,8 for "
+    "blinn-phong.",
+)
 @click.option("--dry-run", is_flag=True, help="Say what would be made; do nothing.")
 @options.workers
 @options.scheduler

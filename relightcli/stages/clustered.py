@@ -65,8 +65,9 @@ class ClusteredStore(LightingStore):
         sky = self.sky
         return len(sky.tree.cell) if sky.changed is None else sky.changed
 
-    def resume(self, previous: Path) -> None:
-        self.sky.resume(previous)
+    def resume(self, previous: Path) -> list[str]:
+        self.sky.resume(self._earlier(previous))
+        return []
 
     def put_light(self, writer: formats.Writer) -> None:
         light = self.sky.light
@@ -175,11 +176,10 @@ class _ClusteredSky:
         self._tracer: Tracer | None = None
         self._seen: dict[bytes, NDArray[np.bool_]] = {}
 
-    def resume(self, path: Path) -> None:
-        """Takes up the light of a radiance store that was made from the same clusters. Raises StoreError if not."""
-        previous = formats.open_store(path, "radiance")
-        if "light/moment" not in previous or previous.inputs.get("store") != self.lighting.store.fingerprint:
-            raise StoreError(f"{path}: was not made from {self.lighting.store.path}, as --from needs it")
+    def resume(self, previous: formats.Store) -> None:
+        """Takes up the light of a radiance store that was made from the same clusters."""
+        if "light/moment" not in previous:
+            raise StoreError(f"{previous.path}: keeps no light of clusters, as --from needs it")
         read: Any = previous.read
         self.light = LeafLight(read("light/flux"), read("light/moment"))
         self._groups = self.fractions.by_group(read("light/irradiance"))

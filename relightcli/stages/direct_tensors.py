@@ -48,14 +48,20 @@ def group_of(lighting: LightingStore) -> dict[str, NDArray[np.int64]]:
     return {name: np.flatnonzero(family == name) for name in (*FAMILIES, MATTE) if (family == name).any()}
 
 
-def put_direct(writer: formats.Writer, lighting: LightingStore, keep: int, threads: int) -> None:
-    """Computes and writes the tensors of all groups, a block of receivers at a time."""
+def put_direct(
+    writer: formats.Writer,
+    lighting: LightingStore,
+    keep: int,
+    threads: int,
+    ranks: tuple[int, int, int] | None = None,
+) -> None:
+    """Computes and writes the tensors of all groups, a block of receivers at a time. ranks: see `direct_model`."""
     for name, receivers in group_of(lighting).items():
         if name == MATTE:
             factors = LightFactors(np.full((2, 2, 1), 1.0 / np.pi, np.float32), np.ones(1, np.float32))
             degrees: list[float] = []
         else:
-            model = direct_model(name)
+            model = direct_model(name, ranks)
             for leaf, values in model.arrays().items():
                 writer.put(f"direct/{name}/brdf/{leaf}", values, dims=ARRAYS[leaf])
             factors, degrees = light_factors(model), model.degrees.tolist()

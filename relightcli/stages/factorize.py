@@ -52,6 +52,7 @@ class Config:
     coefficients: int | None = None
     tolerance: float | None = None
     allow_miss: bool = False
+    brdf_ranks: tuple[int, int, int] | None = None
     workers: int = 1
     overwrite: bool = False
     dry_run: bool = False
@@ -90,6 +91,8 @@ def factorize(config: Config) -> dict[str, Any]:
     clusters = int(label.max()) + 1
     if config.dry_run:
         return {"dry_run": True, "receivers": len(lighting), "clusters": clusters, "notes": []}
+    if config.brdf_ranks is not None:
+        settings["brdf_ranks"] = list(config.brdf_ranks)
     writer = formats.begin(
         config.output,
         KIND,
@@ -120,7 +123,7 @@ def factorize(config: Config) -> dict[str, Any]:
         with account.step("ranks"):
             ranks = _ranks(config, left, writer, setup, basis, order, start, bands if bounces else 0)
         with account.step("direct"):
-            put_direct(writer, lighting, ranks.coefficients, config.workers)
+            put_direct(writer, lighting, ranks.coefficients, config.workers, config.brdf_ranks)
         if bounces:
             with account.step("one-bounce"):
                 _one_bounce(ranks, writer, setup, basis, order, start, bands)

@@ -190,11 +190,20 @@ class LightingStore:
         """Clusters of lights that the last frame changed; None where that is not how light is computed."""
         return None
 
-    def resume(self, previous: Path) -> None:
-        """Takes up the light of an earlier run. Raises InputError where a store has no use for it."""
-        raise InputError(
-            f"--from {previous}: needs a store of clustered lights, which cluster --light-resolution makes"
-        )
+    def resume(self, previous: Path) -> list[str]:
+        """Takes up the light of an earlier run; notes about it. Raises StoreError if that was of another store."""
+        self._earlier(previous)
+        return [
+            f"--from {previous}: nothing of it is of use; only a store of clustered lights, which cluster "
+            "--light-resolution makes, changes light in part. All of it was computed"
+        ]
+
+    def _earlier(self, path: Path) -> formats.Store:
+        """The radiance store at `path`. Raises StoreError if it was not made from this store."""
+        earlier = formats.open_store(path, "radiance")
+        if earlier.inputs.get("store") != self.store.fingerprint:
+            raise StoreError(f"{path}: was not made from {self.store.path}, as --from needs it")
+        return earlier
 
     def set_poses(self, poses: tuple[str, ...]) -> list[str]:
         """Poses skinned objects; notes about it. Raises InputError where a store cannot."""

@@ -240,7 +240,7 @@ def _moving(config: Config, scene: Scene, promise: float | None) -> Moving:
 
 def _subdivided(scene: Scene, geometry: Geometry, moving: Moving | None, shadows: bool) -> Geometry:
     movers = () if moving is None else tuple(geometry.object_names.index(m.mesh.name) for m in moving.movers)
-    finer, materials, what = geometry, list(scene.materials.values()), "highlights"
+    finer, materials, what = geometry, list(scene.materials.values()), "the light on them"
     eyes = np.array([camera.eye for camera in scene.cameras.values()]).reshape(-1, 3)
     lights = np.array([light.center for light in scene.lights.values()]).reshape(-1, 3)
     if shadows:  # faces get small enough for most lobes, but not for the light of a lamp close by

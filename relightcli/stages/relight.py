@@ -55,11 +55,12 @@ def relight(config: Config) -> dict[str, Any]:
             lighting.set_poses(())
             break
     check_moves(config, shots, lighting.set_moves)
+    notes = need_accuracy(config, lighting.store)
     if config.previous is not None:
-        lighting.resume(config.previous)
+        notes += lighting.resume(config.previous)
     written, clocks = [], []
     with Session(lighting, config) as session:
-        session.notes += need_accuracy(config, lighting.store)
+        session.notes += notes
         if config.dry_run:
             return _plan(session, shots, suffix, time.perf_counter() - started)
         if not session.begin(shots):

@@ -19,9 +19,10 @@ from relightcli import __version__
 from relightcli.adapters import images
 from relightcli.adapters.ply import write_ply
 from relightcli.adapters.rays import Tracer
-from relightcli.core.lights.latlong import lookup_many, make_latlong
+from relightcli.core.lights.latlong import make_latlong
 from relightcli.core.shade import picture, primary
-from relightcli.core.transport.camera import film_directions, make_film
+from relightcli.core.shade.backdrop import backdrop
+from relightcli.core.transport.camera import make_film
 from relightcli.errors import NumericalError
 from relightcli.run.accounting import Account, Meter
 from relightcli.scene.model import Camera, Material
@@ -208,7 +209,8 @@ class Session:
         _need_finite(rgb, str(self.config.store))
         alpha = view.coverage
         if self.config.background:
-            behind = environment_behind(environment, shot.env_rotate, view.camera) * (1.0 - alpha[..., None])
+            behind = backdrop(make_latlong(environment, shot.env_rotate), make_film(view.camera), threads)
+            behind *= 1.0 - alpha[..., None]
             if self.config.layers:
                 layers["background"] = behind
             rgb, alpha = rgb + behind, np.ones_like(alpha)
@@ -316,19 +318,6 @@ class Session:
         if error is not None:
             discard(Path(self.config.output), self._writer.partial_path)
         self._writer.close()
-
-
-def environment_behind(environment: NDArray[np.float32], rotate: float, camera: Camera) -> NDArray[np.float32]:
-    """The environment through every pixel, (H, W, 3): the mean of 2 x 2 points."""
-    film = make_film(camera)
-    width, height = camera.size
-    sky = make_latlong(environment, rotate)
-    total = np.zeros((height, width, 3))
-    for dx in (0.25, 0.75):
-        for dy in (0.25, 0.75):
-            x, y = np.arange(width)[None, :] + dx, np.arange(height)[:, None] + dy
-            total += lookup_many(sky, film_directions(film, x, y))
-    return (total / 4.0).astype(np.float32)
 
 
 def _towards(eye: NDArray[np.float64], position: NDArray[np.float64]) -> NDArray[np.float32]:

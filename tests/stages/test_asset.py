@@ -13,7 +13,7 @@ from relightcli.core.measure.errors import relative_rmse
 from relightcli.core.transport.channels import coefficients
 from relightcli.errors import InputError, StoreError
 from relightcli.scene.model import Camera
-from relightcli.stages import cluster, factorize
+from relightcli.stages import brdf_data, cluster, direct_tensors, factorize
 from relightcli.stages.lighting import LightingStore
 from relightcli.stages.relight import Config, relight
 from relightcli.stages.transfer_setup import TransferSetup, coarse_cells
@@ -198,6 +198,20 @@ def test_interrupted_work_is_continued_with_the_same_bytes(transfer, clusters, a
         for name in a.names():
             np.testing.assert_array_equal(a.read(name), b.read(name), err_msg=name)
         assert stage(config)["status"] == "up to date"
+
+
+def test_ranks_of_the_brdf_tensors_are_asked_of_the_models(clusters, tmp_path, monkeypatch):
+    asked = []
+
+    def known(name, ranks=None):
+        asked.append((name, ranks))
+        return brdf_data.direct_model(name)  # another one takes long to make
+
+    monkeypatch.setattr(direct_tensors, "direct_model", known)
+    config = factorize.Config(clusters, tmp_path / "low.zarr", brdf_ranks=(4, 8, 8), quiet=True, workers=2)
+    assert factorize.factorize(config)["status"] == "written"
+    assert asked == [("cook-torrance", (4, 8, 8))]
+    assert formats.open_store(tmp_path / "low.zarr").settings["brdf_ranks"] == [4, 8, 8]
 
 
 def test_every_stage_can_be_path_traced(transfer, clusters, asset):

@@ -322,7 +322,7 @@ def test_from_a_previous_result(clustered, tmp_path):
 
 
 def test_from_refuses_what_it_cannot_use(transfer, clustered, scene):
-    with pytest.raises(InputError, match=r"--from .*needs a store of clustered lights"):
+    with pytest.raises(StoreError, match="kind"):
         radiance(transfer, "x.zarr", "smooth", previous=clustered)
     with pytest.raises(StoreError, match="kind"):
         radiance(clustered, "x.zarr", "smooth", previous=transfer)
@@ -483,7 +483,7 @@ def test_bad_settings(transfer, settings, message):
 
 
 def test_clustered_lights_can_be_path_traced(transfer, clustered):
-    a, b = (picture(store, "traced.exr", reference=True, spp=4) for store in (transfer, clustered))
+    a, b = (picture(store, "traced.exr", reference=True, spp=4)[0] for store in (transfer, clustered))
     np.testing.assert_array_equal(a, b)
 
 

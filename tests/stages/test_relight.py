@@ -273,6 +273,17 @@ def test_tolerance_of_a_reference_is_its_noise(store, tmp_path):
     assert any("was not measured" in note for note in run(store, tmp_path / "a.exr", tolerance=0.1)["notes"])
 
 
+def test_from_an_earlier_run_of_a_store_without_clusters_is_a_note(scene, store, tmp_path):
+    run(store, tmp_path / "a.zarr")
+    told = run(store, tmp_path / "a.exr", previous=tmp_path / "a.zarr")
+    assert any("All of it was computed" in note for note in told["notes"])
+    run(store, tmp_path / "b.exr")
+    np.testing.assert_array_equal(*(read_image(tmp_path / f"{n}.exr").pixels for n in "ab"))
+    other = make_store(scene, "other.zarr", light_resolution=16, refine=2, subdivide=False)
+    with pytest.raises(StoreError, match="was not made from"):
+        run(other, tmp_path / "a.exr", previous=tmp_path / "a.zarr")
+
+
 def test_not_a_store(tmp_path):
     for path in (tmp_path / "none.zarr", tmp_path):
         with pytest.raises(StoreError):
