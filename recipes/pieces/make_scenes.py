@@ -33,7 +33,7 @@ map = "sky.exr"
 eye = [0, 1.5, 2.4]
 target = [0, 0.15, 0]
 fov = 32
-size = [160, 120]
+size = [120, 90]
 """
 PIECE = """
 [objects.{colour}_{kind}]
@@ -52,8 +52,8 @@ SCENES = {
     "duel": [("white", "pawn", -0.5, 0.4), ("black", "rook", 0.4, -0.2)],
     "siege": [("white", "pawn", 0.1, 0.5), ("black", "rook", -0.4, 0.0), ("black", "king", 0.5, -0.4)],
 }
-BOARD = [[-1.5, 0, -1.5], [-1.5, 0, 1.5], [1.5, 0, 1.5], [1.5, 0, -1.5]]  # precompute cuts it finer
-SIDES, STEPS = 24, 40
+HALF, CELLS = 1.5, 32  # of the board
+SIDES, STEPS = 14, 20
 
 
 def piece(outline: list[tuple[float, float]]) -> trimesh.Trimesh:
@@ -71,7 +71,9 @@ folder = Path(sys.argv[1])
 folder.mkdir(parents=True, exist_ok=True)
 for kind, outline in OUTLINES.items():
     piece(outline).export(folder / f"{kind}.ply")
-trimesh.Trimesh(BOARD, [[0, 1, 2], [0, 2, 3]]).export(folder / "board.ply")
+at = np.linspace(-HALF, HALF, CELLS + 1)
+z, x = np.meshgrid(at, at, indexing="ij")
+trimesh.Trimesh(*patch(np.stack([x, 0 * x, z], axis=-1)), process=False).export(folder / "board.ply")
 write_image(folder / "sky.exr", sky_latlong(40.0, overcast=True))
 for name, placed in SCENES.items():
     pieces = [PIECE.format(colour=colour, kind=kind, x=x, z=z) for colour, kind, x, z in placed]

@@ -23,10 +23,10 @@ from relightcli.adapters.meshes import MAX_COORDINATE
 from relightcli.adapters.rays import Tracer
 from relightcli.core.brdf.models import SPECULAR
 from relightcli.core.brdf.separable import POLAR
-from relightcli.core.fields.body import clamped_cosine
+from relightcli.core.fields.body import cosine_weights
 from relightcli.core.fields.chain import EVEN, light_at, put_reflections
 from relightcli.core.fields.close import sent
-from relightcli.core.fields.dimmed import dim, may_block, sky_basis, sky_terms
+from relightcli.core.fields.dimmed import dim, hidden_by, may_block, passing_mirrored, sky_basis, sky_terms
 from relightcli.core.fields.shade import diffuse, never_negative, specular
 from relightcli.core.fields.standing import (
     CELLS,
@@ -42,7 +42,6 @@ from relightcli.core.shade.gather import Gather
 from relightcli.core.shade.lobe_factors import LobeFactors
 from relightcli.core.shade.low_order import response, shade_low_order
 from relightcli.core.shade.seen_points import point_irradiance, point_lobes
-from relightcli.core.sphere import sh
 from relightcli.core.transport.light_visibility import light_bits
 from relightcli.core.transport.local_lights import LocalLights, pack_lights
 from relightcli.core.transport.transfer import local_rotations
@@ -427,11 +426,7 @@ class MovingStore(LightingStore):
         """What stands mirrors the sky as far as the movers let the mirrored view pass."""
         still = rows[rows < self.static]
         out = super()._exact_specular(sky, environment, rotate, coats, view, still)
-        n, v = self.normal[still].astype(np.float64), view[still].astype(np.float64)
-        mirrored = 2.0 * (n * v).sum(axis=1, keepdims=True) * n - v
-        mirrored /= np.maximum(np.linalg.norm(mirrored, axis=1, keepdims=True), 1e-300)
-        passed = (sh.harmonics(mirrored, self.order) * self._where().passed[still]).sum(axis=1)
-        out[still] *= np.clip(passed, 0.0, 1.0)[:, None].astype(np.float32)
+        out[still] *= passing_mirrored(self._where().passed[still], self.normal[still], view[still])[:, None]
         return out
 
     def _local_lights(self) -> tuple[NDArray[np.uint8], LocalLights] | None:
@@ -471,8 +466,7 @@ class MovingStore(LightingStore):
     def _irradiance_of(self, light: F32) -> F32:
         """Irradiance (n, 3) of the standing receivers under light (n, 3, N), past nothing."""
         if self._cosines is None:
-            y = sh.harmonics(self.normal[: self.static].astype(np.float64), self.order)
-            self._cosines = (y * clamped_cosine(self.order)).astype(np.float32)
+            self._cosines = cosine_weights(self.normal[: self.static], self.order)
         out: F32 = np.maximum((light * self._cosines[:, None, :]).sum(axis=2), 0.0)
         return out
 
@@ -502,13 +496,7 @@ class MovingStore(LightingStore):
             placed.gather = own
             return own
         centers, radii = (np.array(x) for x in zip(*(ball(e) for e in placed.entities), strict=True))
-        hidden = np.zeros((n, len(placed.entities), self.order**2), np.float32)
-        for e in range(len(self.movers)):
-            weight = placed.lookup.weight[:n, e]
-            rows = placed.rows[:, 0]
-            hidden[:, e, 0] = EVEN * weight.sum(axis=1)
-            for k in range(weight.shape[1]):
-                hidden[:, e] -= weight[:, k, None] * rows[placed.lookup.place[:n, e, k]]
+        hidden = hidden_by(placed.lookup.points(placed.still), placed.rows[:, 0], len(self.movers))
         placed.gather, share = dim(own, self.position, hidden, centers, radii, self.threads)
         if (share < 1.0).any():
             if placed.share is None:

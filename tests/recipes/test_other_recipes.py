@@ -49,5 +49,5 @@ def test_pieces_are_simulated_once_and_stand_where_they_are_put(make, tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
     assert (done.stdout + done.stderr).count("passed") == 3
     assert len(list((tmp_path / "library").glob("*.zarr"))) == 3
-    strict = make("pieces", OUT=tmp_path, LIMIT=0.001)
+    strict = make("pieces", "check", OUT=tmp_path, LIMIT=0.001)
     assert strict.returncode != 0

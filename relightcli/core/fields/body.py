@@ -125,6 +125,11 @@ def clamped_cosine(order: int) -> NDArray[np.float64]:
     return np.repeat(bands, 2 * np.arange(order) + 1)
 
 
+def cosine_weights(normals: NDArray[np.floating], order: int) -> NDArray[np.float32]:
+    """A_l y_i(n) of unit normals (P, 3), (P, N) float32: with the coefficients of light, the irradiance."""
+    return (sh.harmonics(normals.astype(np.float64), order) * clamped_cosine(order)).astype(np.float32)
+
+
 def diffuse_operator(body: Body) -> NDArray[np.float64]:
     """A_l y_i(n) / pi of every point, (P, N) float64: times the albedo, h of [Pan 2007, Eq. 2]."""
     unit = body.normal.astype(np.float64)

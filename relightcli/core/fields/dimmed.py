@@ -16,6 +16,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from relightcli.core.fields.chain import EVEN
+from relightcli.core.fields.entities import Lookup
 from relightcli.core.lights.environment import SkyCube
 from relightcli.core.parts import in_parts
 from relightcli.core.shade.gather import Gather
@@ -53,6 +55,30 @@ def may_block(
     nearest = points + np.clip(along, 0.0, 1.0)[:, None] * way
     out: NDArray[np.bool_] = ((nearest - center) ** 2).sum(axis=1) <= (radius + light_radius) ** 2
     return out
+
+
+def passing_mirrored(
+    passed: NDArray[np.float32], normals: NDArray[np.floating], view: NDArray[np.floating]
+) -> NDArray[np.float32]:
+    """V_M (n, N) in the direction that mirrors the view (n, 3) at normals (n, 3), cut to 0 .. 1: (n,) float32."""
+    n, v = normals.astype(np.float64), view.astype(np.float64)
+    mirrored = 2.0 * (n * v).sum(axis=1, keepdims=True) * n - v
+    mirrored /= np.maximum(np.linalg.norm(mirrored, axis=1, keepdims=True), 1e-300)
+    values = (sh.harmonics(mirrored, math.isqrt(passed.shape[1])) * passed).sum(axis=1)
+    return np.clip(values, 0.0, 1.0).astype(np.float32)
+
+
+def hidden_by(lookup: Lookup, passes: NDArray[np.float32], movers: int) -> NDArray[np.float32]:
+    """Coefficients (n, E, N) of what each of the first `movers` entities hides of even light, nothing of the others:
+    1 - V_e, from what passes the samples (T, N) that the points read."""
+    n, count = lookup.place.shape[:2]
+    hidden = np.zeros((n, count, passes.shape[1]), np.float32)
+    for e in range(movers):
+        weight = lookup.weight[:, e]
+        hidden[:, e, 0] = EVEN * weight.sum(axis=1)
+        for k in range(weight.shape[1]):
+            hidden[:, e] -= weight[:, k, None] * passes[lookup.place[:, e, k]]
+    return hidden
 
 
 def dim(

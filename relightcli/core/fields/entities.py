@@ -21,6 +21,8 @@ from relightcli.core.fields.interpolate import CORNERS, Grid, locate_one, make_g
 from relightcli.core.parts import in_parts
 from relightcli.core.sphere.rotation import rotation_matrices
 
+_MANY = 4096  # points: fewer are looked up sooner than shared out
+
 
 class Transfer(Protocol):
     """The transfer of an object's samples, in whichever form it is kept."""
@@ -190,6 +192,7 @@ def look_up(entities: list[Entity], points: NDArray[np.floating], skip: NDArray[
     """Looks up all entities but number skip (n,) (-1: none) at points (n, 3) of the world."""
     p = np.ascontiguousarray(points, np.float64)
     count = len(entities)
+    threads = threads if len(p) >= _MANY else 1
     first = np.concatenate([[0], np.cumsum([len(e.own.grid.stand_in) for e in entities])]).astype(np.int64)
     place, weight = np.zeros((len(p), count, CORNERS), np.int32), np.zeros((len(p), count, CORNERS), np.float32)
     distance, nearest = np.empty((len(p), count)), np.empty((len(p), count), np.int32)

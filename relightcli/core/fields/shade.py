@@ -24,6 +24,7 @@ from relightcli.core.sphere.rotation import rotation_matrices
 
 _BLOCK = 2048
 LANES = 64
+_MANY = 16_384  # points: fewer are shaded sooner than shared out
 
 
 class Receivers(NamedTuple):
@@ -70,6 +71,7 @@ def diffuse(
     out = np.empty((len(light), 3), np.float32)
     back = np.ascontiguousarray(turn, np.float32)
     by = receivers.to_diffuse
+    threads = threads if len(light) >= _MANY else 1
     in_parts(lambda a, b: _diffuse(by[a:b], light[a:b], back, out[a:b]), len(light), threads)
     return out
 
