@@ -125,9 +125,8 @@ def test_reflectances(store, model, parameter, value, sky):
 @pytest.mark.parametrize("sky", SKIES)
 @pytest.mark.parametrize(("model", "parameter", "value"), EXTREMES)
 def test_reflectances_by_the_reference(store, model, parameter, value, sky):
-    """The same of path tracing. Two interreflections give 0.8 of what they get again: 1 + 0.8 + 0.64 times as much. A
-    sample of a narrow lobe weighs its albedo, of the sun its radiance times the lobe: single ones may be as bright as
-    the lobe is high, so that under the sun only the even sky's bound is asked of what is not narrow."""
+    """The same of path tracing. Two interreflections give 0.8 of what they get again: 1 + 0.8 + 0.64 times as much. Of
+    the sun a sample holds its radiance times the lobe, which may be as high as one likes: no bound is asked there."""
     rgb = lit(store, SKIES[sky], settings=(f"{model}.{parameter}={value}",), reference=True, spp=8, bounces=2)
     if sky == "even":
         assert rgb.max() < 2.0 * (1 + 0.8 + 0.64)

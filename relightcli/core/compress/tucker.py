@@ -103,6 +103,8 @@ def _leading(flat: NDArray[np.float32], rank: int) -> NDArray[np.float64]:
     """The `rank` leading left singular vectors of a matrix (n, m), fewer if it has fewer; (n, r) by the sign rule."""
     n, m = flat.shape
     width = min(rank + _SPARE, n, m)
+    if width == n:  # no subspace to look for: all of it is asked for
+        return gram_spectrum(mode_gram(flat[:, :, None], 0))[1][:, :rank]
     block = np.random.default_rng(0).standard_normal((m, width)).astype(np.float32)
     q = np.linalg.qr(flat @ block)[0]
     for _ in range(_POWER):

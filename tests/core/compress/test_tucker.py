@@ -234,7 +234,7 @@ def test_cutting_a_pair_would_be_seen():
     assert np.abs(np.roll(near, (1, 1), (1, 2)) - near).max() > 1e-3 * np.abs(near).max()
 
 
-@pytest.mark.parametrize("ranks", [(8, None, 6), (5, 7, 4), (20, None, None)])
+@pytest.mark.parametrize("ranks", [(8, None, 6), (5, 7, 4), (20, None, None), (55, None, 25)])
 def test_sequential_is_near_the_optimum(ranks):
     # Singular values that fall off slowly, as those of transport do.
     rng = np.random.default_rng(3)
