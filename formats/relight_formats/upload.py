@@ -39,6 +39,7 @@ class Target:
         self.finished = False
         """Whether the store that is asked for is there."""
         self._found: bytes | None = None  # the root that may be replaced; None: there was none
+        self._claimed = False
         self._check(overwrite)
 
     def _check(self, overwrite: bool) -> None:
@@ -109,7 +110,12 @@ class Target:
         with contextlib.suppress(OSError):  # where there are folders; an object store may not let one make them
             self.place.fs.makedirs(self.place.path, exist_ok=True)
         self.place.fs.pipe_file((self.place / ROOT).path, content)
-        self._found = content
+        self._found, self._claimed = content, True
+
+    def withdraw(self) -> None:
+        """Takes the claim back, if there is one of ours."""
+        if self._claimed and self._root() == self._found:
+            self.place.fs.rm_file((self.place / ROOT).path)
 
     def send(self) -> None:
         """The finished store in the local folder to the URL; then the folder is deleted.

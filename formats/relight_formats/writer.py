@@ -16,7 +16,7 @@ from relight_formats.fingerprint import fingerprint_bytes, plain
 from relight_formats.header import KEY, ROOT, dump, load_document, write_root
 from relight_formats.ledger import DOCUMENTS, FILE_NAME, LedgerFile, read_ledger
 from relight_formats.lock import Lock
-from relight_formats.publish import publish
+from relight_formats.publish import discard, publish, sealed
 from relight_formats.seal import LEDGER_GROUP, seal
 from relight_formats.upload import Target
 
@@ -318,6 +318,15 @@ class Writer:
         self._ledger.close()
         self._documents.close()
         self._lock.release()
+
+    def abandon(self) -> None:
+        """Delete the unfinished work, which no next run can use, and let go of the lock. After `commit`, or where
+        that was interrupted, the store is whole and stays."""
+        if not self._lock.released and self.partial_path.exists() and not sealed(self.partial_path):
+            discard(self.path, self.partial_path)
+            if self.target is not None:
+                self.target.withdraw()
+        self.close()
 
     def _spoil(self) -> None:
         """No rerun takes up this work any more, for it would fail again; with `--overwrite` one starts afresh."""

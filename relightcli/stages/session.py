@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import relight_formats as formats
-from relight_formats.publish import discard
 from relightcli import __version__
 from relightcli.adapters import images
 from relightcli.adapters.ply import write_ply
@@ -312,12 +311,9 @@ class Session:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """Lets the radiance store go; of one that was not finished nothing is of use to the next run."""
-        if self._writer is None:
-            return
-        if error is not None:
-            discard(Path(self.config.output), self._writer.partial_path)
-        self._writer.close()
+        """Lets the radiance store go; what was not finished is of no use to the next run."""
+        if self._writer is not None:
+            self._writer.abandon()
 
 
 def _towards(eye: NDArray[np.float64], position: NDArray[np.float64]) -> NDArray[np.float32]:

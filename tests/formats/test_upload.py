@@ -171,3 +171,17 @@ def test_what_is_no_store_is_not_touched(memory) -> None:
         start(URL, overwrite=True)
     assert files(memory) == {"letter", ROOT}
     assert left() == []
+
+
+def test_abandoned_work_leaves_nothing(memory) -> None:
+    writer = start(URL)
+    assert writer is not None
+    assert files(memory) == {ROOT}
+    writer.abandon()
+    assert files(memory) == set()
+    assert left() == []
+    run(URL)
+    writer = start(URL, 2.0, overwrite=True)
+    assert writer is not None
+    writer.abandon()  # a finished store stays
+    assert open_store(URL).attrs is not None

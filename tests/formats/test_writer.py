@@ -284,3 +284,17 @@ def test_metadata_on_disk_is_in_the_documented_spelling(tmp_path: Path) -> None:
     for file in (tmp_path / "store").rglob("zarr.json"):
         document = json.loads(file.read_bytes())
         assert file.read_text() == json.dumps(document, indent=2, sort_keys=True) + "\n"
+
+
+def test_abandoned_work_is_deleted_and_a_finished_store_is_not(tmp_path: Path) -> None:
+    writer = start(tmp_path / "store")
+    assert writer is not None
+    writer.abandon()
+    writer.abandon()
+    assert list(tmp_path.iterdir()) == []
+    run(tmp_path / "store")
+    with new(tmp_path / "other") as writer:
+        writer.commit({})
+        writer.abandon()  # interrupted between the commit and the end
+    assert open_store(tmp_path / "store").fingerprint
+    assert open_store(tmp_path / "other").fingerprint

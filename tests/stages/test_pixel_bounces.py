@@ -7,7 +7,7 @@ import pytest
 
 import relight_formats as formats
 from relightcli.core.measure.errors import relative_rmse
-from relightcli.errors import InputError, StoreError
+from relightcli.errors import StoreError
 from relightcli.run import blocks as run
 from relightcli.scene.model import Camera, Material
 from relightcli.stages import lighting, visibility_job
@@ -154,7 +154,7 @@ def test_radiance_stores_hold_vertices_too(pixels, vertices, tmp_path):
 
 
 def test_bound_to_the_camera(pixels, tmp_path):
-    with pytest.raises(InputError, match="pixels of camera 'main'"):
+    with pytest.raises(StoreError, match="pixels of camera 'main'"):
         layers_of(pixels, "a.exr", camera="other")
     with pytest.raises(StoreError, match="not vertices"):
         relight(RelightConfig(store=pixels, output=str(tmp_path / "a.ply"), env="smooth", quiet=True))
