@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from relightcli.core.measure.errors import relative_rmse
 from relightcli.core.transport.channels import coefficients
 from relightcli.errors import InputError, StoreError
 from relightcli.scene.model import Camera
-from relightcli.stages import brdf_data, cluster, direct_tensors, factorize
+from relightcli.stages import cluster, direct_tensors, factorize
 from relightcli.stages.lighting import LightingStore
 from relightcli.stages.relight import Config, relight
 from relightcli.stages.transfer_setup import TransferSetup, coarse_cells
@@ -205,13 +206,16 @@ def test_ranks_of_the_brdf_tensors_are_asked_of_the_models(clusters, tmp_path, m
 
     def known(name, ranks=None):
         asked.append((name, ranks))
-        return brdf_data.direct_model(name)  # another one takes long to make
+        raise InterruptedError  # to make one takes long
 
     monkeypatch.setattr(direct_tensors, "direct_model", known)
     config = factorize.Config(clusters, tmp_path / "low.zarr", brdf_ranks=(4, 8, 8), quiet=True, workers=2)
-    assert factorize.factorize(config)["status"] == "written"
+    with pytest.raises(InterruptedError):
+        factorize.factorize(config)
     assert asked == [("cook-torrance", (4, 8, 8))]
-    assert formats.open_store(tmp_path / "low.zarr").settings["brdf_ranks"] == [4, 8, 8]
+    assert json.loads((tmp_path / "low.zarr.partial/zarr.json").read_text())["attributes"]["relight"]["settings"][
+        "brdf_ranks"
+    ] == [4, 8, 8]
 
 
 def test_every_stage_can_be_path_traced(transfer, clusters, asset):
