@@ -23,7 +23,6 @@ from relightcli.core.lights.environment import latlong_to_cube
 from relightcli.core.lights.leaf_light import LeafLight, Splitter
 from relightcli.core.lights.points import Points, split_points
 from relightcli.core.lights.quadtree import Tree, build_tree, first_leaves, leaves_at, solid_angles
-from relightcli.core.parts import in_parts
 from relightcli.core.shade.cluster_sum import Fractions, Lobes
 from relightcli.core.shade.seen_points import point_irradiance, point_lobes
 from relightcli.errors import InputError, StoreError
@@ -188,11 +187,11 @@ class _ClusteredSky:
         if self._given is not None and self._given[0] is environment and self._given[1] == rotate:
             self.changed = 0
             return
-        rest, self.points, _ = split_points(environment, rotate, self.lighting.threads)
+        rest, self.points, _ = split_points(environment, rotate)
         splitter = self._splitter_of(rest.shape[0], rest.shape[1], rotate)
         threads, old = self.lighting.threads, self.light
         if self._rest is not None and self._given is not None and self._given[1] == rotate and old is not None:
-            rows = changed_rows(self._rest, rest, threads) if self._rest.shape == rest.shape else None
+            rows = changed_rows(self._rest, rest) if self._rest.shape == rest.shape else None
         else:
             rows = None
         if rows is not None and old is not None and self._rest is not None:
@@ -226,9 +225,7 @@ class _ClusteredSky:
 
     def lit(self) -> NDArray[np.float32]:
         """Irradiance (N, 3) of all."""
-        return self.fractions.rounded(
-            self._groups, self.of_points() if len(self.points.flux) else None, self.lighting.threads
-        )
+        return self.fractions.rounded(self._groups, self.of_points() if len(self.points.flux) else None)
 
     def of_points(self) -> NDArray[np.float64]:
         """Irradiance (N, 3) of the points."""
@@ -334,32 +331,21 @@ class _BakedLobes:
                 self.table,
                 lighting.threads,
             )
-        return self.lobes.put(self._even, more, self.rows, len(lighting), lighting.threads)
+        return self.lobes.put(self._even, more, self.rows, len(lighting))
 
 
-def changed_rows(old: NDArray[np.float32], new: NDArray[np.float32], threads: int = 1) -> NDArray[np.int64]:
+def changed_rows(old: NDArray[np.float32], new: NDArray[np.float32]) -> NDArray[np.int64]:
     """Per column of two maps (H, W, 3) the range of rows that differ, (W, 2), half open; empty where none do."""
     rows = np.zeros((old.shape[1], 2), np.int64)
-    before, after = (np.ascontiguousarray(m, np.float32).reshape(len(m), -1).view(np.uint32) for m in (old, new))
-    in_parts(lambda a, b: _changed_rows(before, after, rows, a, b), len(rows), threads)
+    _changed_rows(np.ascontiguousarray(old), np.ascontiguousarray(new), rows)
     return rows
 
 
 @njit(cache=True, nogil=True)
-def _changed_rows(old, new, rows, first, last):  # type: ignore[no-untyped-def]
-    """Bits of old and new (H, 3 W)."""
-    for i in range(len(old)):
-        apart = np.uint32(0)
-        for k in range(3 * first, 3 * last):
-            apart |= old[i, k] ^ new[i, k]
-        if apart == 0:  # as good as always
-            continue
-        for j in range(first, last):
-            if (
-                old[i, 3 * j] != new[i, 3 * j]
-                or old[i, 3 * j + 1] != new[i, 3 * j + 1]
-                or (old[i, 3 * j + 2] != new[i, 3 * j + 2])
-            ):
+def _changed_rows(old, new, rows):  # type: ignore[no-untyped-def]
+    for i in range(old.shape[0]):
+        for j in range(old.shape[1]):
+            if old[i, j, 0] != new[i, j, 0] or old[i, j, 1] != new[i, j, 1] or old[i, j, 2] != new[i, j, 2]:
                 if rows[j, 1] == 0:
                     rows[j, 0] = i
                 rows[j, 1] = i + 1

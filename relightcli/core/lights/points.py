@@ -15,7 +15,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.lights.latlong import texel_solid_angles
-from relightcli.core.parts import in_parts
 from relightcli.core.sphere import cube
 
 RESOLUTION = 256  # of the cube: 0.35 degrees
@@ -33,7 +32,7 @@ class Points(NamedTuple):
 
 
 def split_points(
-    radiance: NDArray[np.float32], rotate_degrees: float = 0.0, threads: int = 1
+    radiance: NDArray[np.float32], rotate_degrees: float = 0.0
 ) -> tuple[NDArray[np.float32], Points, NDArray[np.int64]]:
     """A map (H, W, 3) without its points, the points as they lie after a turn by `rotate_degrees` about +Y, and the
     flat indices of the pixels that went into them. The map is returned as it is if there are none."""
@@ -44,7 +43,7 @@ def split_points(
     solid = texel_solid_angles(height, width)
     source = np.ascontiguousarray(radiance, np.float32)
     rows, peaks = np.empty(height), np.empty(height)
-    in_parts(lambda a, b: _row_flux(source[a:b], solid[a:b], rows[a:b], peaks[a:b]), height, threads)
+    _row_flux(source, solid, rows, peaks)
     least = LEAST * float(rows.sum())
     # The mean over a texel and the pixels on its rim: if it has enough, one of them is as bright.
     level = least / (16.0 * math.pi / (6 * RESOLUTION**2) + solid)

@@ -21,6 +21,7 @@ from relightcli.core.lights.leaf_light import LeafLight
 from relightcli.core.parts import in_parts
 
 GROUP = 64
+FEW = 16  # clusters that one thread changes sooner than several start
 NONE, ALL = -1, -2
 ALIKE = 1e-3  # how far a colour's mean direction may be from that of all for one cosine to do
 
@@ -88,20 +89,17 @@ class Fractions:
         in_parts(
             lambda a, b: _add_all(self.place[a:b], self.mixed, self.normal[a:b], clusters, *light, out[a:b]),
             len(out),
-            threads,
+            threads if len(clusters) > FEW else 1,
         )
 
     def by_receiver(self, groups: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N, 3) of values by groups, (G, 3, 64)."""
         return np.ascontiguousarray(groups.transpose(0, 2, 1)).reshape(-1, 3)[: self.count]
 
-    def rounded(
-        self, groups: NDArray[np.float64], more: NDArray[np.float64] | None, threads: int = 1
-    ) -> NDArray[np.float32]:
+    def rounded(self, groups: NDArray[np.float64], more: NDArray[np.float64] | None) -> NDArray[np.float32]:
         """(N, 3) float32 of values by groups plus `more` (N, 3)."""
         out = np.empty((self.count, 3), np.float32)
-        some = np.zeros((0, 3)) if more is None else more
-        in_parts(lambda a, b: _round(groups, some, out, a, b), len(out), threads)
+        _round(groups, np.zeros((0, 3)) if more is None else more, out)
         return out
 
     def by_group(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -173,8 +171,8 @@ def _keep(column, place, mixed, first):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _round(groups, more, out, first, last):  # type: ignore[no-untyped-def]
-    for i in range(first, last):
+def _round(groups, more, out):  # type: ignore[no-untyped-def]
+    for i in range(len(out)):
         for c in range(3):
             value = groups[i // GROUP, c, i % GROUP]
             if len(more):
@@ -260,27 +258,21 @@ class Lobes:
         in_parts(
             lambda a, b: _sum_lobes(self.place[a:b], self.mixed, self.scale, clusters, flux, out[a:b]),
             len(out),
-            threads,
+            threads if len(clusters) > FEW else 1,
         )
 
     def put(
-        self,
-        groups: NDArray[np.float64],
-        more: NDArray[np.float64] | None,
-        rows: NDArray[np.int64],
-        count: int,
-        threads: int = 1,
+        self, groups: NDArray[np.float64], more: NDArray[np.float64] | None, rows: NDArray[np.int64], count: int
     ) -> NDArray[np.float32]:
         """Specular light by groups (G, 3, 64) plus `more` (n, 3), at the `rows` (n,) of (count, 3); not below 0."""
         out = np.zeros((count, 3), np.float32)
-        some = np.zeros((0, 3)) if more is None else more
-        in_parts(lambda a, b: _put(groups, some, rows, out, a, b), len(rows), threads)
+        _put(groups, np.zeros((0, 3)) if more is None else more, rows, out)
         return out
 
 
 @njit(cache=True, nogil=True)
-def _put(groups, more, rows, out, first, last):  # type: ignore[no-untyped-def]
-    for j in range(first, last):
+def _put(groups, more, rows, out):  # type: ignore[no-untyped-def]
+    for j in range(len(rows)):
         for c in range(3):
             value = groups[j // GROUP, c, j % GROUP]
             if len(more):
