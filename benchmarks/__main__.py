@@ -16,7 +16,7 @@ from typing import Any
 
 from benchmarks import compare, report
 
-# Ceilings, peers and whole stages; in about 20 minutes on two cores that do nothing else.
+# Ceilings, peers and whole stages: the short ones.
 SHORT = ("visibility", "picture", "mitsuba", "sh_transfer", "sky_matrix", "store", "scheduler", "asset")
 LONG = (
     "growth",
