@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 @click.option("--heatmap", type=options.PATH, help="Write the first metric per pixel as a picture.")
 @click.option("--report", type=options.PATH, help="Write one self-contained HTML page.")
 @click.option("--dry-run", is_flag=True, help="Name what would be compared; do nothing.")
+@options.no_seed
+@options.no_workers
 @options.report
 @click.pass_context
 def command(

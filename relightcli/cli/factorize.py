@@ -67,6 +67,7 @@ def _ranks(context: click.Context, parameter: click.Parameter, value: str | None
     "blinn-phong.",
 )
 @click.option("--dry-run", is_flag=True, help="Say what would be made; do nothing.")
+@options.no_seed
 @options.workers
 @options.scheduler
 @options.overwrite

@@ -55,6 +55,7 @@ from relightcli.cli import options
     help="Relative error of held-out frames: take the smallest model within it, whatever --model and --lobes say.",
 )
 @click.option("--dry-run", is_flag=True, help="Say what would be made; do nothing.")
+@options.no_seed
 @options.workers
 @options.scheduler
 @options.overwrite

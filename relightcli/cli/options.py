@@ -61,6 +61,20 @@ def workers(command: Command) -> Command:
     )(command)
 
 
+def no_seed(command: Command) -> Command:
+    """For scripts that give every stage the same options."""
+    return click.option(
+        "--seed", type=SEED, expose_value=False, help="As other stages take it; this one draws nothing at random."
+    )(command)
+
+
+def no_workers(command: Command) -> Command:
+    """For scripts that give every stage the same options."""
+    return click.option(
+        "--workers", type=click.IntRange(1, 1024), expose_value=False, help="As stages take it; one process does it."
+    )(command)
+
+
 def scheduler(command: Command) -> Command:
     return click.option(
         "--scheduler",

@@ -202,3 +202,11 @@ def test_a_reader_that_goes_away_is_no_error(store):
     process.stderr.close()
     assert process.wait(60) == 0, stderr.decode()
     assert b"Traceback" not in stderr
+
+
+@pytest.mark.parametrize("name", ["precompute", "cluster", "factorize", "fit-pose", "relight", "diff"])
+def test_every_stage_takes_the_common_options(name):
+    done = program(name, "--help", cwd=ROOT)
+    shown = done.stdout.decode()
+    for option in ("--workers", "--seed", "--json", "--quiet", "--verbose", "--version", "--tolerance", "--dry-run"):
+        assert option in shown, option
