@@ -73,17 +73,16 @@ class AssetStore(LightingStore):
         if bounces > self.bounces:
             raise StoreError(f"--bounces {bounces}: the asset has {self.bounces}; use the transfer store it came from")
         coats = self._coats_of(materials)
-        if basis is None and coats.shiny.any() and view is None:
-            raise InputError("a material with a specular lobe looks different from everywhere: name a --camera")
         if basis is not None:
             parts = super().exit_radiance(environment, rotate, materials, view, active, basis, 0)
-        if basis is not None and bounces == 0:
-            return parts
+            if bounces == 0:
+                return parts
+            return parts + self._tensor_bounces(*self._sky_of(environment, rotate), coats, view, active, bounces)
+        if coats.shiny.any() and view is None:
+            raise InputError("a material with a specular lobe looks different from everywhere: name a --camera")
         sky, spread = self._sky_of(environment, rotate)
 
         def direct() -> list[Radiance]:
-            if basis is not None:
-                return parts
             return [self._direct_tensors(sky, spread, environment, rotate, coats, view, active)]
 
         if bounces == 0:
