@@ -41,6 +41,7 @@ EXCUSED: dict[str, str] = {
     "measure/heatmap.py": "colours of a picture of 8 bits",
     "measure/noise_free.py": "a mean of products whose noise is stated beside it",
     "parts.py": _WHOLE,
+    "lights/bright_cells.py": _SUMS,
     "pose/beside.py": _SUMS,
     "pose/frames.py": _WHOLE,
     "pose/pose_model.py": "lobes, scores and regressions of its neighbours",

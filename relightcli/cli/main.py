@@ -8,6 +8,7 @@ import logging
 import os
 import signal
 import sys
+import warnings
 from importlib import import_module
 from types import FrameType
 from typing import Any
@@ -84,6 +85,9 @@ def run(arguments: list[str]) -> int:
         error.show()
         return 2
     except (click.exceptions.Abort, KeyboardInterrupt):
+        if not verbose:  # what zarr's event loop was about to do may complain while it is dropped
+            sys.unraisablehook = lambda _: None
+            warnings.simplefilter("ignore")
         click.echo(
             "relightcli: interrupted; finished blocks are kept, run the same command again to continue", err=True
         )

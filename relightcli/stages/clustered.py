@@ -1,6 +1,7 @@
 """Direct light from clusters of the sky: any map of any resolution, and only what changed from one map to the next.
 
-the map             small bright places become points, for which rays are traced; the rest is shared out over leaves
+the map             small bright places become points, for which rays are traced; the rest is shared out over leaves.
+                    Cells that hold much of it are cut into smaller lights (`core.lights.bright_cells`)
 a new map           moments of the leaves that changed, and what they change in the irradiance [Johan and Nishita,
                     Eq. 15, with C_t for the printed C_i]
 specular lobes      as baked in for one view; their colour may change. Without a fixed view: integrated from the
@@ -9,6 +10,7 @@ specular lobes      as baked in for one view; their colour may change. Without a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from numpy.typing import NDArray
 import relight_formats as formats
 from relightcli.adapters.rays import Tracer
 from relightcli.core.brdf.models import SPECULAR, MaterialTable, widen
+from relightcli.core.lights.bright_cells import bright_cells, cut
 from relightcli.core.lights.environment import latlong_to_cube
 from relightcli.core.lights.leaf_light import LeafLight, Splitter
 from relightcli.core.lights.points import Points, split_points
@@ -74,6 +77,8 @@ class ClusteredStore(LightingStore):
         writer.put("light/flux", light.flux, dims=("cluster", "colour"), units="W sr-1 m-2 sr")
         writer.put("light/moment", light.moment, dims=("cluster", "colour", "axis"), units="W m-2")
         writer.put("light/irradiance", self.sky.irradiance, dims=("receiver", "colour"), units="W m-2")
+        if len(self.sky.bright):
+            writer.put("light/bright", self.sky.bright, dims=("bright",))
 
     @property
     def sky(self) -> _ClusteredSky:
@@ -145,10 +150,30 @@ class Runs:
         return np.stack([values[last[k] : last[k + 1]].sum(axis=0) for k in cells])
 
 
-class _ClusteredSky:
-    """The map in clusters, and its points.
+class _Cut:
+    """The cells of a tree that are cut under the last light."""
 
-    changed: clusters whose light the last `set_light` changed, None where all were summed.
+    def __init__(self, runs: Runs, cells: NDArray[np.int32], error: NDArray[np.float32], resolution: int) -> None:
+        self.runs, self.cells, self.error, self.resolution = runs, cells, error, resolution
+        self._known: tuple[NDArray[Any], ...] = ()
+        self._parts = Points(np.zeros((0, 3)), np.zeros((0, 3)))
+
+    def of(self, light: LeafLight, rest: NDArray[np.float32], rotate: float) -> tuple[NDArray[np.int64], Points]:
+        """Bright cells under the light of a map, and their parts: the last ones if their light has not changed."""
+        flux = self.runs.sum(light.flux)
+        bright = bright_cells(flux, self.error)
+        known = (bright, flux[bright], self.runs.sums(light.moment, bright), np.array([*rest.shape, rotate]))
+        if not same(known, self._known):
+            self._known = known
+            self._parts = cut(self.cells[bright], flux[bright], self.resolution, rest, rotate)
+        return bright, self._parts
+
+
+class _ClusteredSky:
+    """The map in clusters, and what is summed apart from them.
+
+    points: small bright places; bright: cells with fractions that are cut, parts: what they are cut into; changed:
+    clusters whose light the last `set_light` changed, None where all were summed.
     """
 
     def __init__(self, lighting: ClusteredStore) -> None:
@@ -165,9 +190,12 @@ class _ClusteredSky:
         radius = 0.5 * np.sqrt(solid_angles(own, self.tree.resolution))
         self.fractions = Fractions(columns, lighting.normal, radius)
         self.runs = Runs(self.tree, own)
+        self._cut = _Cut(self.runs, own, read("light_clusters/error"), self.tree.resolution)
         self.light: LeafLight | None = None
         self._groups: NDArray[np.float64] = np.zeros((0, 3, 64))
-        self.points = Points(np.zeros((0, 3)), np.zeros((0, 3)))
+        self.points = self.parts = Points(np.zeros((0, 3)), np.zeros((0, 3)))
+        self.bright = np.zeros(0, np.int64)
+        self._apart: tuple[Points, NDArray[np.float64]] | None = None
         self.changed: int | None = None
         self._given: tuple[NDArray[np.float32], float] | None = None
         self._rest: NDArray[np.float32] | None = None
@@ -181,6 +209,7 @@ class _ClusteredSky:
             raise StoreError(f"{previous.path}: keeps no light of clusters, as --from needs it")
         read: Any = previous.read
         self.light = LeafLight(read("light/flux"), read("light/moment"))
+        self.bright = read("light/bright") if "light/bright" in previous else self.bright
         self._groups = self.fractions.by_group(read("light/irradiance"))
 
     def set_light(self, environment: NDArray[np.float32], rotate: float) -> None:
@@ -199,21 +228,34 @@ class _ClusteredSky:
             new = LeafLight(old.flux + (come.flux - gone.flux), old.moment + (come.moment - gone.moment))
         else:
             new = splitter.light(rest, threads)
-        self._given, self._rest = (environment, rotate), rest
+        self._given, self._rest, self.light = (environment, rotate), rest, new
+        was = self.bright
+        self.bright, self.parts = self.cut(self._cut)
         if old is not None:
             changed = np.flatnonzero((new.moment != old.moment).any(axis=(1, 2)))
             if len(changed) <= PARTLY * len(new.moment):
-                runs = np.unique(self.runs.of[changed])
-                before, after = (LeafLight(*(self.runs.sums(v, runs) for v in light)) for light in (old, new))
+                runs = np.union1d(self.runs.of[changed], np.setxor1d(was, self.bright))
+                before, after = (
+                    _without(LeafLight(*(self.runs.sums(v, runs) for v in light)), np.isin(runs, bright))
+                    for light, bright in ((old, was), (new, self.bright))
+                )
                 self.fractions.change(self._groups, runs, before, after, threads)
-                self.light, self.changed = new, len(changed)
+                self.changed = len(changed)
                 return
-        self._groups = self.fractions.sum(LeafLight(*map(self.runs.sum, new)), threads)
-        self.light, self.changed = new, None
+        every = LeafLight(*map(self.runs.sum, new))
+        self._groups = self.fractions.sum(_without(every, self.bright), threads)
+        self.changed = None
+
+    def cut(self, cells: _Cut) -> tuple[NDArray[np.int64], Points]:
+        """Bright ones of some cells, and what they are cut into."""
+        assert self.light is not None
+        assert self._rest is not None
+        assert self._given is not None
+        return cells.of(self.light, self._rest, self._given[1])
 
     @property
     def irradiance(self) -> NDArray[np.float64]:
-        """Irradiance (N, 3) of all but the points."""
+        """Irradiance (N, 3) of all but the points and the bright cells."""
         return self.fractions.by_receiver(self._groups)
 
     def _splitter_of(self, height: int, width: int, rotate: float) -> Splitter:
@@ -225,17 +267,27 @@ class _ClusteredSky:
 
     def lit(self) -> NDArray[np.float32]:
         """Irradiance (N, 3) of all."""
-        return self.fractions.rounded(self._groups, self.of_points() if len(self.points.flux) else None)
+        points = both(self.points, self.parts)
+        if not len(points.flux):
+            return self.fractions.rounded(self._groups, None)
+        if self._apart is None or not same(self._apart[0], points):
+            normal = self.lighting.normal
+            self._apart = (points, point_irradiance(self.seen(points), points, normal, self.lighting.threads))
+        return self.fractions.rounded(self._groups, self._apart[1])
 
-    def of_points(self) -> NDArray[np.float64]:
-        """Irradiance (N, 3) of the points."""
-        return point_irradiance(self.seen(), self.points, self.lighting.normal, self.lighting.threads)
-
-    def seen(self) -> NDArray[np.bool_]:
+    def seen(self, points: Points) -> NDArray[np.bool_]:
         """Who sees the points, (K, N)."""
-        found = np.zeros((len(self.points.direction), len(self.lighting)), bool)
-        for row, direction in zip(found, self.points.direction, strict=True):
+        found = np.zeros((len(points.direction), len(self.lighting)), bool)
+        for row, direction in zip(found, points.direction, strict=True):
             row[:] = self.sees(direction)
+        return found
+
+    def visible(self, points: Points) -> NDArray[np.float32]:
+        """Visible part of the clusters that the points lie in, (K, N): enough for what highlights make of it."""
+        runs = self.runs.of[leaves_at(self.tree, points.direction)]
+        found = np.empty((len(runs), len(self.lighting)), np.float32)
+        for row, run in zip(found, runs.tolist(), strict=True):
+            np.multiply(self.fractions.of(run), np.float32(1.0 / 255.0), out=row)
         return found
 
     def sees(self, direction: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -277,8 +329,12 @@ class _BakedLobes:
         self.table = MaterialTable(read("light_clusters/model"), read("light_clusters/parameters"))
         self.lobes = Lobes(read("light_clusters/lobe"), read("light_clusters/lobe_scale"))
         self._good: tuple[_Coats, NDArray[np.float32]] | None = None  # what has been checked
-        self.runs = Runs(tree, read(f"light_clusters/{LOBE}"))
+        cells = read(f"light_clusters/{LOBE}")
+        self.runs = Runs(tree, cells)
+        self._cut = _Cut(self.runs, cells, read("light_clusters/lobe_error"), tree.resolution)
         self._of: LeafLight | None = None
+        self._parts = Points(np.zeros((0, 3)), np.zeros((0, 3)))
+        self._apart: tuple[Points, NDArray[np.float64]] | None = None
         self._flux: NDArray[np.float64] | None = None
         self._even = self.lobes.dark()
 
@@ -311,7 +367,9 @@ class _BakedLobes:
             self._good = (coats, view)
         assert sky.light is not None
         if self._of is not sky.light:
-            flux = self.runs.sum(sky.light.flux)
+            bright, self._parts = sky.cut(self._cut)
+            flux = self.runs.sum(sky.light.flux).copy()
+            flux[bright] = 0.0
             old = np.zeros_like(flux) if self._flux is None else self._flux
             changed = np.flatnonzero((flux != old).any(axis=1))
             if len(changed) > PARTLY * len(old):
@@ -319,11 +377,13 @@ class _BakedLobes:
                 self._even = self.lobes.dark()
             self.lobes.add(self._even, changed, flux[changed] - old[changed], lighting.threads)
             self._of, self._flux = sky.light, flux
-        more = None
-        if len(sky.points.flux):
+        points = both(sky.points, self._parts)
+        if not len(points.flux):
+            return self.lobes.put(self._even, None, self.rows, len(lighting))
+        if self._apart is None or not same(self._apart[0], points):
             more = point_lobes(
-                sky.seen(),
-                sky.points,
+                np.concatenate([sky.seen(sky.points), sky.visible(self._parts)]),
+                points,
                 lighting.normal,
                 self.view,
                 self.rows,
@@ -331,7 +391,26 @@ class _BakedLobes:
                 self.table,
                 lighting.threads,
             )
-        return self.lobes.put(self._even, more, self.rows, len(lighting))
+            self._apart = (points, more)
+        return self.lobes.put(self._even, self._apart[1], self.rows, len(lighting))
+
+
+def both(one: Points, other: Points) -> Points:
+    return Points(*(np.concatenate(pair) for pair in zip(one, other, strict=True)))
+
+
+def same(one: Sequence[NDArray[Any]], other: Sequence[NDArray[Any]]) -> bool:
+    return len(one) == len(other) and all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+def _without(light: LeafLight, cells: NDArray[np.bool_] | NDArray[np.int64]) -> LeafLight:
+    """Light of cells but for some of them."""
+    if not len(cells):
+        return light
+    flux, moment = light.flux.copy(), light.moment.copy()
+    flux[cells] = 0.0
+    moment[cells] = 0.0
+    return LeafLight(flux, moment)
 
 
 def changed_rows(old: NDArray[np.float32], new: NDArray[np.float32]) -> NDArray[np.int64]:

@@ -26,7 +26,7 @@ from relightcli.run.blocks import Block, Info
 JUDGED = 8_192  # receivers with lobes that a cell is judged by, about
 KEPT = 2_048  # transfer vectors that a process keeps for the neighbours of a cell
 CHECKS = 256  # random lights at which the clusters are compared with rays
-PART = {"all": 1.0, "diffuse": 0.45, "lobes": 0.85}  # of epsilon: parts of the light have cells of their own
+PART = {"all": 1.0, "diffuse": 0.45, "lobes": 1.2}  # of epsilon: parts of the light have cells of their own
 FINEST_STEP = 0.5  # of a lobe's transfer, in parts of epsilon: its rounding, even over a step, is 0.14 epsilon
 DIFFUSE, LOBE = "diffuse_cell", "lobe_cell"  # cells with fractions, and with lobes: each a run of clusters
 SCRATCH = "bits.partial"  # visibility by texel, while the store is written

@@ -68,8 +68,9 @@ def open_folder(config: Config, scene: Scene) -> str:
         changed = [k for k in header if not isinstance(found, dict) or found.get(k) != header[k]]
         if not config.overwrite:
             raise StoreError(
-                f"{folder}: was made with another {', '.join(changed)}, and what is measured would not compare; "
-                "choose another folder, or --overwrite to start anew"
+                f"{folder}: was made with another {', '.join(changed)}, and what is measured would not compare "
+                f"(inputs: {config.scene} and the files that it names); choose another folder, or --overwrite to start "
+                "anew"
             )
         shutil.rmtree(folder / "runs", ignore_errors=True)
     folder.mkdir(exist_ok=True)

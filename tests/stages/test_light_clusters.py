@@ -12,8 +12,10 @@ import relight_formats as formats
 from relightcli.adapters.images import read_environment, write_image
 from relightcli.core.lights import quadtree
 from relightcli.core.measure.errors import relative_rmse
+from relightcli.core.sphere import cube
 from relightcli.errors import InputError, StoreError
 from relightcli.scene.model import Camera, Material
+from relightcli.stages import clustered as clustered_stage
 from relightcli.stages import light_cluster_job
 from relightcli.stages.clustered import ClusteredStore, Runs
 from relightcli.stages.light_clusters import Config, cluster_lights
@@ -277,6 +279,53 @@ def test_thousand_edits_end_where_a_full_relight_does(clustered):
     a, b = lighting.sky.irradiance, fresh.sky.irradiance
     assert relative_rmse(a, b) < 1e-5
     assert a.max() < 1  # all lamps are gone
+
+
+def window(clustered, brightness):
+    """A dim sky with a window, two pixels wide, in a corner of the cluster that is wrong by most."""
+    cells, error = cells_of(clustered), formats.open_store(clustered).read("light_clusters/error")
+    wide = (cells[:, 2] - cells[:, 1] >= 8) & (cells[:, 4] - cells[:, 3] >= 8)
+    face, r0, _, c0, _ = cells[np.where(wide, error, 0.0).argmax()].tolist()
+    d = cube.face_directions(face, np.array(2.0 * (c0 + 1) / 64 - 1), np.array(2.0 * (r0 + 1) / 64 - 1))
+    row = round((0.5 - math.asin(d[1]) / math.pi) * 128)
+    column = round((0.5 - math.atan2(d[0], d[2]) / (2 * math.pi)) * 256)
+    sky = np.full((128, 256, 3), 0.001, np.float32)
+    sky[row - 1 : row + 1, column - 1 : column + 1] = brightness
+    return sky
+
+
+def test_window_in_a_part_of_a_cluster_lights_from_there(transfer, clustered, monkeypatch):
+    """Half as wrong as from whole clusters, at least, where a cluster is lit in a corner."""
+    sky = window(clustered, 20.0)
+    exact = irradiance(transfer, sky)
+    lighting = ClusteredStore(clustered, 1)
+    (found,) = lighting.exit_radiance(sky, 0.0, lighting.scene.materials, None, bounces=0)
+    assert len(lighting.sky.bright) > 0
+    monkeypatch.setattr(clustered_stage, "bright_cells", lambda flux, error: np.zeros(0, np.int64))
+    whole = irradiance(clustered, sky)
+    assert relative_rmse(found.diffuse, exact) < 0.5 * relative_rmse(whole, exact)
+
+
+def test_windows_come_and_go_without_a_trace(clustered, tmp_path):
+    """What is cut depends on the light alone: edits, and a picture taken up again, end where a full relight does."""
+    dim, lit, brighter = (window(clustered, v) for v in (0.01, 20.0, 35.0))
+    lighting = ClusteredStore(clustered, 1)
+
+    def shine(sky):
+        (direct,) = lighting.exit_radiance(sky, 0.0, lighting.scene.materials, None, bounces=0)
+        return direct.diffuse
+
+    for sky in (dim, lit, brighter, lit, dim, lit):
+        now = shine(sky)
+        np.testing.assert_allclose(now, irradiance(clustered, sky), rtol=1e-6, atol=1e-9)
+        assert bool(len(lighting.sky.bright)) == (sky is not dim)
+    for k, sky in enumerate((lit, dim)):
+        write_image(tmp_path / f"{k}.exr", sky)
+    radiance(clustered, "lit.zarr", tmp_path / "0.exr")
+    resumed, _ = radiance(clustered, "resumed.zarr", tmp_path / "1.exr", previous=clustered.parent / "lit.zarr")
+    anew, _ = radiance(clustered, "anew.zarr", tmp_path / "1.exr")
+    first, second = (formats.open_store(store).read("light/irradiance") for store in (resumed, anew))
+    np.testing.assert_allclose(first, second, rtol=1e-6, atol=1e-12)
 
 
 def test_edit_changes_its_clusters_only(clustered):

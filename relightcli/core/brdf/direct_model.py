@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -66,7 +66,8 @@ class DirectModel:
     view (n, n_o), light (n, n_i), core (n_h, n_o, n_i) float64: U_h, U_o, U_i, D over the n cells of
     `disc_grid(resolution)`; degrees (L,), radius (R,), energy (H, R, L) float64 as in `SpecularLobes`; importance
     (n_i,) float64 as in `LightFactors`; albedo (H, POLAR) float64: A at cos(theta_o) = k / (POLAR - 1); cell_albedo
-    (H, n) float64: its mean over view cells; error (H,) float64: |f - f^| / |f| of every entry, lobes on both sides.
+    (H, n) float64: its mean over view cells; error (H,) float64: |f - f^| / |f| of every entry, lobes on both sides;
+    tables: of the entries that `setting` has met.
     """
 
     family: str
@@ -83,6 +84,7 @@ class DirectModel:
     albedo: NDArray[np.float64]
     cell_albedo: NDArray[np.float64]
     error: NDArray[np.float64]
+    tables: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = field(default_factory=dict, repr=False)
 
     def arrays(self) -> dict[str, NDArray[np.float64]]:
         """All arrays by name; with `family` and `resolution` they make the model again (`from_arrays`)."""
@@ -130,7 +132,8 @@ class MaterialSetting(NamedTuple):
 
 def from_arrays(family: str, resolution: int, arrays: Mapping[str, NDArray[Any]]) -> DirectModel:
     """The model whose `arrays` these are."""
-    return DirectModel(family, resolution, *(np.asarray(arrays[name], np.float64) for name in ARRAYS))
+    known: Any = {name: np.asarray(arrays[name], np.float64) for name in ARRAYS}
+    return DirectModel(family, resolution, **known)
 
 
 def default_points(family: str) -> NDArray[np.float64]:
@@ -252,8 +255,10 @@ def setting(model: DirectModel, *values: float) -> MaterialSetting:
     found = mix(model, *values)
     table = np.zeros((VIEW_SIDE * VIEW_SIDE, model.light.shape[1] + 1))
     energy = np.zeros((POLAR, len(model.degrees)))
-    for entry in np.flatnonzero(found.weights):
-        of_table, of_energy = _entry(model, int(entry))
+    for entry in np.flatnonzero(found.weights).tolist():
+        if entry not in model.tables:
+            model.tables[entry] = _entry(model, entry)
+        of_table, of_energy = model.tables[entry]
         table += found.weights[entry] * of_table
         energy += found.weights[entry] * of_energy
     table = table.reshape(VIEW_SIDE, VIEW_SIDE, -1)

@@ -73,8 +73,23 @@ def latlong_to_cube(radiance: NDArray[np.float32], resolution: int, rotate_degre
             )  # fmt: skip
 
     in_parts(walk, 2, 2)
-    out = parts[0] + parts[1]
-    return SkyCube(resolution, out[:, :, 0].copy(), out[:, :, 1:].copy())
+    sky = _dark(resolution)
+    _join(parts[0], parts[1], sky.flux, sky.moment)
+    return sky
+
+
+def _dark(resolution: int) -> SkyCube:
+    texels = 6 * resolution * resolution
+    return SkyCube(resolution, np.zeros((texels, 3)), np.zeros((texels, 3, 3)))
+
+
+@njit(cache=True, nogil=True)
+def _join(one, other, flux, moment):  # type: ignore[no-untyped-def]
+    for texel in range(len(one)):
+        for c in range(3):
+            flux[texel, c] = one[texel, c, 0] + other[texel, c, 0]
+            for q in range(3):
+                moment[texel, c, q] = one[texel, c, 1 + q] + other[texel, c, 1 + q]
 
 
 @lru_cache(maxsize=4)
@@ -281,11 +296,9 @@ def splat(sky: SkyCube) -> SkyCube:
     its shadow at the right place, softened over one texel, and even light stays where it was. Flux and moments keep
     their totals and the moments their true directions.
     """
-    resolution = sky.resolution
-    out = np.zeros((6 * resolution * resolution, 3, 4))
-    padded = _padded_index(resolution)
-    _splat(sky.flux, sky.moment, resolution, padded, out)
-    return SkyCube(resolution, out[:, :, 0].copy(), out[:, :, 1:].copy())
+    out = _dark(sky.resolution)
+    _splat(sky.flux, sky.moment, sky.resolution, _padded_index(sky.resolution), out.flux, out.moment)
+    return out
 
 
 @lru_cache(maxsize=4)
@@ -298,7 +311,7 @@ def _padded_index(resolution: int) -> NDArray[np.int32]:
 
 
 @njit(cache=True, nogil=True)
-def _splat(flux, moment, resolution, padded, out):  # type: ignore[no-untyped-def]
+def _splat(flux, moment, resolution, padded, to_flux, to_moment):  # type: ignore[no-untyped-def]
     for texel in range(len(flux)):
         total = flux[texel, 0] + flux[texel, 1] + flux[texel, 2]
         if total == 0.0:
@@ -332,6 +345,6 @@ def _splat(flux, moment, resolution, padded, out):  # type: ignore[no-untyped-de
                     continue
                 target = padded[face, i + di, j + dj]
                 for c in range(3):
-                    out[target, c, 0] += w * flux[texel, c]
+                    to_flux[target, c] += w * flux[texel, c]
                     for q in range(3):
-                        out[target, c, 1 + q] += w * moment[texel, c, q]
+                        to_moment[target, c, q] += w * moment[texel, c, q]

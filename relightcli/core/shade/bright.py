@@ -40,14 +40,14 @@ def split_bright(sky: SkyCube, count: int = COUNT) -> tuple[SkyCube, Bright]:
     Both together are the sky. sky: best after `environment.splat`, so that a sun between texels is shared by them.
     """
     area = np.tile(cube.solid_angles(sky.resolution).reshape(-1), 6)
-    luminance = (sky.flux @ LUMINANCE) / area
+    power = sky.flux @ LUMINANCE
+    luminance = power / area
     order = np.argpartition(luminance, -count - 1)[-count - 1 :]
     level = max(float(luminance[order].min()), 0.0)
     texel = np.sort(order[luminance[order] > level])
     share = 1.0 - level / luminance[texel]
     flux, moment = sky.flux[texel] * share[:, None], sky.moment[texel] * share[:, None, None]
-    total = float((sky.flux @ LUMINANCE).sum())
-    if len(texel) == 0 or float((flux @ LUMINANCE).sum()) < LEAST * total:
+    if len(texel) == 0 or float((flux @ LUMINANCE).sum()) < LEAST * float(power.sum()):
         none = np.zeros((0, 3))
         return sky, Bright(np.zeros(0, np.int64), none, none, np.zeros((0, 3, 3)))
     rest = SkyCube(sky.resolution, sky.flux.copy(), sky.moment.copy())

@@ -15,18 +15,18 @@ from relightcli.core.brdf.models import MaterialTable, lobes_and_density
 from relightcli.core.lights.points import Points
 from relightcli.core.parts import in_parts
 
+Seen = NDArray[np.bool_] | NDArray[np.float32]
 
-def point_irradiance(
-    seen: NDArray[np.bool_], points: Points, normal: NDArray[np.float32], threads: int
-) -> NDArray[np.float64]:
-    """E (N, 3), W m^-2, of K points: seen (K, N) bool; normal (N, 3) unit."""
+
+def point_irradiance(seen: Seen, points: Points, normal: NDArray[np.float32], threads: int) -> NDArray[np.float64]:
+    """E (N, 3), W m^-2, of K points: seen (K, N) bool, or the visible part as float32; normal (N, 3) unit."""
     out = np.zeros((len(normal), 3))
     in_parts(lambda a, b: _irradiance(a, b, seen, points.direction, points.flux, normal, out), len(normal), threads)
     return out
 
 
 def point_lobes(
-    seen: NDArray[np.bool_],
+    seen: Seen,
     points: Points,
     normal: NDArray[np.float32],
     view: NDArray[np.float32],
@@ -70,7 +70,7 @@ def _irradiance(first, last, seen, directions, flux, normal, out):  # type: igno
                 cosine = normal[i, 0] * x + normal[i, 1] * y + normal[i, 2] * z
                 if cosine > 0.0:
                     for c in range(3):
-                        out[i, c] += cosine * flux[k, c]
+                        out[i, c] += cosine * np.float64(seen[k, i]) * flux[k, c]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -84,4 +84,4 @@ def _lobes(first, last, seen, directions, flux, normal, view, rows, material, mo
                 l = (directions[k, 0], directions[k, 1], directions[k, 2])  # noqa: E741
                 _, lobe, _, _ = lobes_and_density(model[material[i]], parameters[material[i]], n, l, v)
                 for c in range(3):
-                    out[j, c] += lobe * flux[k, c]
+                    out[j, c] += lobe * np.float64(seen[k, i]) * flux[k, c]

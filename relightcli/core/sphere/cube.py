@@ -6,6 +6,8 @@ face has its centre at s = (2j + 1)/R - 1, t = (2i + 1)/R - 1. Flat texel index:
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,12 +41,18 @@ def texel_directions(resolution: int) -> NDArray[np.float64]:
     return np.stack([face_directions(face, c[None, :], c[:, None]) for face in range(6)])
 
 
+@lru_cache(maxsize=8)
 def solid_angles(resolution: int) -> NDArray[np.float64]:
-    """Exact solid angle of the texels of one face, (R, R) float64, sr; the same for every face, 6 faces sum to 4 pi."""
+    """Exact solid angle of the texels of one face, (R, R) float64, sr; the same for every face, 6 faces sum to 4 pi.
+
+    Read-only: it is made once.
+    """
     # Odd and even numerators over R: edges, and their distances, free of rounding where R is a power of two.
     edge = (2.0 * np.arange(resolution + 1) - resolution) / resolution
     low, high, width = edge[:-1], edge[1:], 2.0 / resolution
-    return rectangle_solid_angles(low[None, :], high[None, :], low[:, None], high[:, None], width * width)
+    found = rectangle_solid_angles(low[None, :], high[None, :], low[:, None], high[:, None], width * width)
+    found.flags.writeable = False
+    return found
 
 
 def rectangle_solid_angles(

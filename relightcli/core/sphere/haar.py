@@ -14,20 +14,26 @@ from numpy.typing import NDArray
 
 def forward(faces: NDArray[np.floating]) -> NDArray[np.float64]:
     """Haar coefficients of faces (..., R, R), float64."""
-    out = np.array(faces, np.float64)
+    out = np.array(faces, np.float64, order="C")
     size = out.shape[-1]
-    while size > 1:
-        block = out[..., :size, :size]
-        a, b = block[..., 0::2, 0::2], block[..., 0::2, 1::2]
-        c, d = block[..., 1::2, 0::2], block[..., 1::2, 1::2]
-        parts = 0.5 * (a + b + c + d), 0.5 * (a - b + c - d), 0.5 * (a + b - c - d), 0.5 * (a - b - c + d)
-        half = size // 2
-        out[..., :half, :half] = parts[0]
-        out[..., :half, half:size] = parts[1]
-        out[..., half:size, :half] = parts[2]
-        out[..., half:size, half:size] = parts[3]
-        size = half
+    _forward(out.reshape(-1, size, size), np.empty((size, size)))
     return out
+
+
+@njit(cache=True, nogil=True)
+def _forward(faces, scratch):  # type: ignore[no-untyped-def]
+    for face in faces:
+        size = len(scratch)
+        while size > 1:
+            half = size // 2
+            for i in range(half):
+                for j in range(half):
+                    a, b = face[2 * i, 2 * j], face[2 * i, 2 * j + 1]
+                    c, d = face[2 * i + 1, 2 * j], face[2 * i + 1, 2 * j + 1]
+                    scratch[i, j], scratch[i, half + j] = 0.5 * (a + b + c + d), 0.5 * (a - b + c - d)
+                    scratch[half + i, j], scratch[half + i, half + j] = 0.5 * (a + b - c - d), 0.5 * (a - b - c + d)
+            face[:size, :size] = scratch[:size, :size]
+            size = half
 
 
 def inverse(coefficients: NDArray[np.floating]) -> NDArray[np.float64]:

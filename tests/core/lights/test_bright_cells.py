@@ -1,0 +1,80 @@
+"""Cells that hold much of a map's light: which ones are cut, and that their parts hold what the cells did."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from relightcli.core.lights.bright_cells import LEAST, MOST, PARTS, bright_cells, cut
+from relightcli.core.lights.environment import latlong_to_cube
+from relightcli.core.sphere import cube
+
+SIDE = 64
+
+
+def test_cells_are_chosen_by_their_share_of_the_error():
+    flux = np.ones((1000, 3))
+    flux[7], flux[500] = 400.0, 300.0
+    error = np.full(1000, 0.05)
+    total = 998.0 + 700.0
+    assert 0.05 * 300.0 / total > LEAST
+    assert bright_cells(flux, error).tolist() == [7, 500]
+    error[7] = 0.5 * LEAST * total / 400.0
+    assert bright_cells(flux, error).tolist() == [500]
+    assert len(bright_cells(np.zeros((5, 3)), np.ones(5))) == 0
+    assert len(bright_cells(np.ones((100, 3)), np.ones(100))) == MOST
+    # Whatever the light is scaled by, and for light that was taken away.
+    assert bright_cells(-1e9 * flux, error).tolist() == [500]
+
+
+@pytest.mark.parametrize("face", range(6))
+@pytest.mark.parametrize("turn", [0.0, 73.0])
+def test_parts_hold_the_light_of_the_texels_that_they_cover(face, turn):
+    """A map whose radiance is linear in the direction: against the exact flux of the texels, to what the samples, a
+    pixel apart, miss of a part's borders."""
+    height = 256
+    latitude = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
+    longitude = np.pi * (1.0 - 2.0 * (np.arange(2 * height) + 0.5) / (2 * height))
+    d = np.stack(
+        [np.sin(longitude) * np.cos(latitude)[:, None], np.sin(latitude)[:, None] + 0 * longitude,
+         np.cos(longitude) * np.cos(latitude)[:, None]], -1,
+    )  # fmt: skip
+    sky = (1.0 + 0.9 * d).astype(np.float32)
+    texels = latlong_to_cube(sky, SIDE, turn).flux.reshape(6, SIDE, SIDE, 3)
+    cell = np.array([[face, 16, 32, 40, 48]])
+    inside = texels[face, 16:32, 40:48]
+    whole = inside.sum(axis=(0, 1))
+    found = cut(cell, whole[None], SIDE, sky, turn)
+    parts = inside.reshape(PARTS, 4, PARTS, 2, 3).sum(axis=(1, 3)).reshape(-1, 3)
+    np.testing.assert_allclose(found.flux.sum(axis=0), whole, rtol=1e-12)
+    np.testing.assert_allclose(found.flux, parts, rtol=0.02)
+    np.testing.assert_allclose(
+        found.direction.reshape(PARTS, PARTS, 3),
+        cube.face_directions(
+            face,
+            (2.0 * (40 + 2 * np.arange(PARTS)[None, :] + 1.0) / SIDE) - 1.0,
+            (2.0 * (16 + 4 * np.arange(PARTS)[:, None] + 2.0) / SIDE) - 1.0,
+        ),
+        atol=1e-15,
+    )
+
+
+def test_only_lit_parts_are_kept_and_single_texels_stay_whole():
+    sky = np.zeros((128, 256, 3), np.float32)
+    sky[60:64, 126:130] = 5.0  # about +Z
+    cells = np.array([[4, 0, SIDE, 0, SIDE], [4, 32, 33, 32, 33]])
+    flux = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    found = cut(cells, flux, SIDE, sky)
+    assert 1 < len(found.flux) < PARTS * PARTS + 1
+    np.testing.assert_allclose(found.flux[-1], flux[1], rtol=1e-12)
+    np.testing.assert_allclose(found.flux.sum(axis=0), flux.sum(axis=0), rtol=1e-12)
+    assert (found.direction[:, 2] > 0.9).all()
+    assert len(cut(cells[:0], flux[:0], SIDE, sky).flux) == 0
+
+
+def test_light_that_the_samples_miss_or_take_for_nothing_is_spread_evenly():
+    cells, flux = np.array([[0, 0, SIDE, 0, SIDE]]), np.array([[1.0, 0.0, 2.0]])
+    for sky in (np.zeros((8, 16, 3), np.float32), np.full((8, 16, 3), -1.0, np.float32)):
+        found = cut(cells, flux, SIDE, sky)
+        assert len(found.flux) == PARTS * PARTS
+        np.testing.assert_allclose(found.flux, np.tile(flux / PARTS**2, (PARTS**2, 1)), rtol=1e-12)
