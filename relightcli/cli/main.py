@@ -60,7 +60,12 @@ def main(arguments: list[str] | None = None) -> None:
     Ends the process without taking the interpreter down module by module, which costs a third of a second after a
     picture: what the exit handlers do is done, files are closed, the rest is memory.
     """
-    code = run(sys.argv[1:] if arguments is None else arguments)
+    given = sys.argv[1:] if arguments is None else arguments
+    if not _is_verbose(given):
+        # After an interruption zarr's event loop complains, with tracebacks, about what it was about to do.
+        sys.unraisablehook = lambda _: None
+        warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
+    code = run(given)
     atexit._run_exitfuncs()
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):
@@ -68,11 +73,15 @@ def main(arguments: list[str] | None = None) -> None:
     os._exit(code)
 
 
+def _is_verbose(arguments: list[str]) -> bool:
+    return any(a == "--verbose" or (a.startswith("-v") and a.strip("v") == "-") for a in arguments)
+
+
 def run(arguments: list[str]) -> int:
     """Runs one command line and returns its exit code; prints errors to stderr, tracebacks only with -v."""
     signal.signal(signal.SIGTERM, _interrupt)
     _occupy_closed_streams()
-    verbose = any(a == "--verbose" or (a.startswith("-v") and a.strip("v") == "-") for a in arguments)
+    verbose = _is_verbose(arguments)
     # After an error zarr's event loop complains, with tracebacks, about the chunks that nobody waits for any more.
     logging.getLogger("asyncio").disabled = not verbose
     try:
@@ -85,9 +94,6 @@ def run(arguments: list[str]) -> int:
         error.show()
         return 2
     except (click.exceptions.Abort, KeyboardInterrupt):
-        if not verbose:  # what zarr's event loop was about to do may complain while it is dropped
-            sys.unraisablehook = lambda _: None
-            warnings.simplefilter("ignore")
         click.echo(
             "relightcli: interrupted; finished blocks are kept, run the same command again to continue", err=True
         )

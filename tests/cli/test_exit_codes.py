@@ -174,3 +174,36 @@ def test_names_that_are_no_text(here):
     done = shell(r"mv sky-sky.exr $'sk\xff.exr'; $R relight t.zarr -o out.exr --env $'sk\xff.exr'", here)
     assert done.returncode == 2
     assert b"its name is not UTF-8" in done.stderr
+
+
+HALF_DONE = """
+import sys
+from relightcli.cli import main
+
+
+class Loop:
+    def __del__(self):
+        raise AttributeError("half made")
+
+
+async def chunk():
+    pass
+
+
+def interrupted(*arguments, **options):
+    loop, reading = Loop(), chunk()
+    raise KeyboardInterrupt
+
+
+main.group.main = interrupted
+main.main(["diff", *sys.argv[1:]])
+"""
+
+
+@pytest.mark.parametrize("verbose", [False, True])
+def test_interrupted_while_an_event_loop_is_made(tmp_path, verbose):
+    command = [sys.executable, "-W", "default", "-c", HALF_DONE, *["-v"][: int(verbose)]]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, timeout=60)
+    assert done.returncode == 130
+    assert (done.stderr.count(b"\n") == 1) is not verbose
+    assert b"interrupted" in done.stderr
