@@ -28,9 +28,9 @@ from relightcli.core.fields.chain import EVEN, light_at, put_reflections
 from relightcli.core.fields.close import sent
 from relightcli.core.fields.dimmed import dim, hidden_by, may_block, passing_mirrored, sky_basis, sky_terms
 from relightcli.core.fields.shade import diffuse, diffuse_by_order, never_negative, specular
+from relightcli.core.fields.sites import Between
 from relightcli.core.fields.standing import (
     CELLS,
-    Between,
     light_from_lobes,
     light_from_sky,
     light_from_surfaces,

@@ -16,7 +16,7 @@ from relightcli.core.fields.body import Body, axes
 from relightcli.core.fields.entities import Entity, Surroundings, of_light
 from relightcli.core.fields.interpolate import make_grid
 from relightcli.core.fields.shade import Receivers
-from relightcli.core.fields.standing import Between, between
+from relightcli.core.fields.sites import Between, between, outlook, spread_out
 from relightcli.core.shade.low_order import response
 from relightcli.core.sphere.rotation import rotation_matrices
 from relightcli.errors import InputError
@@ -157,7 +157,8 @@ def _read_object(
         kept.proxies,
     )
     colour = pack_materials([material]).parameters[0, SPECULAR : SPECULAR + 3].astype(np.float32)
-    chosen = np.unique(np.linspace(0, len(body.point) - 1, SITES).astype(int))
+    outlooks = outlook(body.point, body.normal, body.radius)
+    chosen = spread_out(outlooks, SITES)
     on_surface = body.point[chosen]
     sites = np.concatenate([kept.proxies, on_surface + INWARDS * (body.center - on_surface)])
     coated = material.adjustable and body.terms > 1
@@ -173,7 +174,7 @@ def _read_object(
         _receivers(body, kept, material, any_albedo),
         colour,
         sites,
-        between(body.point, on_surface),
+        between(outlooks, outlooks[chosen]),
     )
 
 
