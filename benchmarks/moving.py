@@ -6,6 +6,7 @@ Errors are relative RMS over the whole picture, shadow edges and outlines includ
 
 from __future__ import annotations
 
+import shutil
 import time
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from benchmarks.interreflections import Picture, error
 from benchmarks.moving_scenes import MAKERS, MovingScene, ball, write
 from benchmarks.processes import cores
-from benchmarks.report import Report, Table, at_most
+from benchmarks.report import Report, Row, Table, at_most
 from benchmarks.scenes import Setting
 
 BOUNCES = 1
@@ -29,6 +30,8 @@ CURVE: tuple[tuple[str, tuple[int, ...]], ...] = (
     ("field_resolution", (4, 8, 16)),
     ("field_proxies", (1, 2, 4, 8, 16)),
 )
+
+FALLING_FROM = {"field_order": 4}  # fewer bands are no default of anything
 
 
 def measure(setting: Setting) -> Report:
@@ -68,13 +71,16 @@ def measure(setting: Setting) -> Report:
         table.append((made.scene.name, f"precompute took {seconds:.0f} s", "", "", "", "", ""))
     columns = ("scene", "place", "picture, %", "direct, %", "reflected twice, %", "FLIP", "light, ms")
     report.tables.append(Table("error of every place", columns, tuple(table)))
-    report.tables.append(_curve(setting, size, spp, cells, detail))
+    curve, falling = _curve(setting, size, spp, cells, detail)
+    report.rows += falling
+    report.tables.append(curve)
     report.tables.append(_suns(setting, size, spp, cells, detail))
     return report
 
 
-def _curve(setting: Setting, size: tuple[int, int], spp: int, cells: int, detail: int) -> Table:
-    """Error of the ball, close to the floor and next to a lamp, as each setting of its fields grows."""
+def _curve(setting: Setting, size: tuple[int, int], spp: int, cells: int, detail: int) -> tuple[Table, list[Row]]:
+    """Error of the ball, close to the floor and next to a lamp, as each setting of its fields grows; and whether it
+    falls."""
     from benchmarks.moving_scenes import lamp
 
     made = lamp(cells, detail)
@@ -82,16 +88,29 @@ def _curve(setting: Setting, size: tuple[int, int], spp: int, cells: int, detail
     path = write(made, setting.work / "curve", size)
     sky = _sky(path.parent, False)
     rows: list[tuple[str | int | float, ...]] = []
+    falling: list[Row] = []
     refs: list[Picture] = []
+    known: dict[tuple[int, ...], tuple[float, ...]] = {}
     for key, values in CURVE[:1] if setting.quick else CURVE:
+        found = {}
         for value in values[:2] if setting.quick else values:
-            store, seconds = _store(path, f"{key}-{value}", False, **{**BASE, key: value})
-            refs = refs or _references(store, sky, made.places[0], 4 * spp)
-            ours, milliseconds = _picture(store, sky, made.places[0])
-            errors = [error(ours[name], *(r[name] for r in refs)) for name in LAYERS]
-            rows.append((key.removeprefix("field_"), value, *errors, milliseconds, seconds))
+            fields = {**BASE, key: value}
+            settings = tuple(fields.values())
+            if settings not in known:
+                store, seconds = _store(path, f"{key}-{value}", False, **fields)
+                refs = refs or _references(store, sky, made.places[0], 4 * spp)
+                ours, milliseconds = _picture(store, sky, made.places[0])
+                known[settings] = *(error(ours[n], *(r[n] for r in refs)) for n in LAYERS), milliseconds, seconds
+                shutil.rmtree(store)
+            found[value] = known[settings]
+            rows.append((key.removeprefix("field_"), value, *known[settings]))
+        first, last = max(min(found), FALLING_FROM.get(key, 0)), max(found)
+        for what, k in (("picture", 0), ("reflected twice", 2)):
+            if first in found and found[first][k] > 0.0:
+                work = f"{what}: error at {key.removeprefix('field_')} {last}, of that at {first}"
+                falling.append(at_most(work, found[last][k] / found[first][k], "", 1.0))
     columns = ("knob", "value", "picture, %", "direct, %", "reflected twice, %", "light, ms", "precompute, s")
-    return Table("a ball, a floor and a lamp close by, as its fields grow", columns, tuple(rows))
+    return Table("a ball, a floor and a lamp close by, as its fields grow", columns, tuple(rows)), falling
 
 
 def _suns(setting: Setting, size: tuple[int, int], spp: int, cells: int, detail: int) -> Table:

@@ -107,9 +107,9 @@ def heuristic():
     return np.array(errors)
 
 
-@case("sites around a point", "fields/standing.py", "at a site, 1e-9 beside it, 1e6 away", "float32", 0.7, ROUNDINGS)
+@case("sites around a point", "fields/sites.py", "at a site, 1e-9 beside it, 1e6 away", "float32", 0.7, ROUNDINGS)
 def sites():
-    from relightcli.core.fields.standing import between
+    from relightcli.core.fields.sites import between
 
     place = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3.0], [5, 5, 5]])
     points = np.array([[0.0, 0, 0], [1 + 1e-9, 0, 0], [0.3, 0.2, 0.1], [1e6, 0, 0]])

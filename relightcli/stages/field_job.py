@@ -18,7 +18,7 @@ from relightcli.adapters.rays import Tracer
 from relightcli.core.fields.body import Body
 from relightcli.core.fields.build import field_samples
 from relightcli.core.fields.compression import compress
-from relightcli.core.fields.self_transfer import diffuse_part, exits_of, solve
+from relightcli.core.fields.self_transfer import exits_of, solve
 from relightcli.run import blocks as run
 from relightcli.scene.model import Material
 from relightcli.stages.bodies import body_of
@@ -97,6 +97,7 @@ class SelfWorker:
         proxies = formats.worker_array(self.job.partial, f"{spec.prefix}proxies")[:]
         found = solve(tracer, body, np.asarray(proxies), spec.tolerance, spec.seed)
         formats.worker_array(self.job.partial, f"{spec.prefix}{WORK}/self")[...] = found.transfer
+        formats.worker_array(self.job.partial, f"{spec.prefix}{WORK}/by_order")[...] = found.by_order
         return {"rays": float(found.rays), "noise": found.noise, "reflections": float(found.rounds)}
 
 
@@ -171,9 +172,9 @@ class PackWorker:
         hidden = -np.asarray(work("occlusion")[...], np.float64)
         hidden[:, :, 0] += np.sqrt(4.0 * np.pi)
         packed += pack_per_shell("hidden", hidden)
-        own = np.asarray(work("self")[...])
-        packed += rounded("self", diffuse_part(body, own), ("point", "harmonic", "reflected_colour"))
+        packed += rounded("self", np.asarray(work("by_order")[...]), ("point", "harmonic", "part"))
         if body.terms > 1:
+            own = np.asarray(work("self")[...])
             whole = own.sum(axis=1, dtype=np.float64, keepdims=True).astype(np.float32)
             tolerance = OF_WHOLE * spec.transfer_tolerance
             packed += pack_transfer("self_whole/", compress(whole, tolerance=tolerance, seed=spec.seed), tolerance)
@@ -235,6 +236,7 @@ def make_room(writer: formats.Writer, spec: FieldSpec) -> None:
     rows = max(1, CHUNK_BYTES // (4 * spec.proxies * n * n * spec.colours))
     for name, outer, outer_chunks, inner, dims in (
         ("self", (spec.points,), (rows,), size, ("point", *matrix)),
+        ("by_order", (spec.points,), (rows,), (n, 1 + 2 * spec.colours), ("point", "harmonic", "part")),
         ("occlusion", shape, chunks, (n,), ("shell", "direction", "harmonic")),
         ("transfer", shape, chunks, size, ("shell", "direction", *matrix)),
     ):

@@ -7,8 +7,9 @@ A field lies under a prefix: `fields/0/` in a transfer store, none in a store of
     radii, proxies, valid                  see `core.fields.field.Field`
     hidden                                 the whole sphere less the occlusion, of every sample
     transfer/...                           the transfer, compressed (`core.fields.compression`)
-    self                                   irradiance / pi of the points per light about the object, self transfer
-                                           included: A_l y_i(n) / pi times it
+    self                                   irradiance / pi of the points per light about the object, A_l y_i(n) / pi
+                                           times their self transfer: without own reflections, which is one part for
+                                           all colours; what one of them adds; what all others add
     self_whole/...                         of objects with a specular lobe: the self transfer, compressed
 
 Whole numbers of more than 8 bits lie as two planes of bytes, the low ones q - 256 high, then the high ones rint(q /
@@ -47,8 +48,9 @@ class Packed(NamedTuple):
 class KeptField:
     """A field as it is kept: see `core.fields.field.Field`; occlusion (S 6nn, N) float32.
 
-    self_diffuse (P, N, C) float32: diffuse exit radiance of points of albedo 1 per light about the object; self_whole
-    (P, N, N, C) float32: their self transfer, None where nothing shines.
+    self_by_order (P, N, 1 + 2 C) float32: diffuse exit radiance of points of albedo 1 per light about the object (see
+    `core.fields.self_transfer.Solution`); self_whole (P, N, N, C) float32: their self transfer, None where nothing
+    shines.
     """
 
     radii: NDArray[np.float64]
@@ -57,7 +59,7 @@ class KeptField:
     proxies: NDArray[np.float64]
     occlusion: NDArray[np.float32]
     transfer: CompressedTransfer
-    self_diffuse: NDArray[np.float32]
+    self_by_order: NDArray[np.float32]
     self_whole: NDArray[np.float32] | None
 
 

@@ -9,7 +9,7 @@ it.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,10 +27,10 @@ from relightcli.core.fields.body import cosine_weights
 from relightcli.core.fields.chain import EVEN, light_at, put_reflections
 from relightcli.core.fields.close import sent
 from relightcli.core.fields.dimmed import dim, hidden_by, may_block, passing_mirrored, sky_basis, sky_terms
-from relightcli.core.fields.shade import diffuse, never_negative, specular
+from relightcli.core.fields.shade import diffuse, diffuse_by_order, never_negative, specular
+from relightcli.core.fields.sites import Between
 from relightcli.core.fields.standing import (
     CELLS,
-    Between,
     light_from_lobes,
     light_from_sky,
     light_from_surfaces,
@@ -56,18 +56,25 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 STEPS = ("views", "look_up", "reflections", "light", "suns", "all")
 SLAB = 8192  # receivers whose sky terms are made at a time
+ALL_ORDERS = 3  # interreflections from which on those of a mover on itself are not told apart in a picture's sum
 
 
 @dataclass
 class _Passed:
     """Light on its way in one picture: at the proxies after the last reflection, (P, 3, N); and, of all reflections so
     far together, that which was reflected again, at the proxies, at the sites from behind (S, 3, N), and what the
-    samples send that are read early, and the close points', in rows as `chain.open_rows` has them."""
+    samples send that are read early, and the close points', in rows as `chain.open_rows` has them.
+
+    number of the last reflection; before: the same as it was one earlier, if that is needed; at_points: light at the
+    movers' points that were lit, of the last reflections, the last one first."""
 
     at_proxies: F32
     reflected: F32
     behind: F32
     rows: F32
+    number: int = 0
+    before: _Passed | None = None
+    at_points: tuple[F32, ...] = ()
 
 
 class MovingStore(LightingStore):
@@ -100,6 +107,7 @@ class MovingStore(LightingStore):
         self._seconds: dict[str, float] = dict.fromkeys(STEPS, 0.0)
         self._bits_of_lights: dict[tuple[object, ...], NDArray[np.uint8]] = {}
         self._passed: _Passed | None = None
+        self._asked_bounces = 0
         self._cosines: F32 | None = None  # of the standing receivers
         self._undimmed: tuple[F64, NDArray[np.bool_], str, F32] | None = None
 
@@ -157,7 +165,7 @@ class MovingStore(LightingStore):
         return {
             "seconds": {name: seconds / max(self._pictures, 1) for name, seconds in self._seconds.items()},
             "samples": made,
-            "sample_hits": 1.0 - made / max(reads, made),
+            "sample_hits": 1.0 - made / max(reads, made, 1),
             "sun_rays": 0 if self._suns is None else self._suns.rays,
         }
 
@@ -188,6 +196,7 @@ class MovingStore(LightingStore):
             self.movers[e] = mover.dyed(materials[mover.material])
             if self._placed is not None:
                 self._placed.entities[e] = replace(self._placed.entities[e], own=self.movers[e].own)
+        self._asked_bounces = self.bounces if bounces is None else bounces
         started = time.perf_counter()
         parts = super().exit_radiance(environment, rotate, materials, view, active, basis, bounces)
         if not self.apart:
@@ -364,54 +373,79 @@ class MovingStore(LightingStore):
         assert passed is not None
         passed.at_proxies = self._at(placed, placed.proxies, rows, behind[self._sites.on_proxy])
         passed.behind += rest
+        spread = self._sites.spread
         if self.apart:
-            self._light_points(placed, rows, rest, None, view, out)
+            light = self._at(placed, placed.points, rows, rest, spread=spread)
+            chosen = None
         elif len(placed.shown):
-            self._light_points(placed, rows, rest, placed.shown, None, out)
+            chosen = placed.shown
+            own = chosen - self.static
+            some = Between(spread.site[own], spread.weight[own])
+            light = self._at(placed, own + placed.points.start, rows, rest, spread=some)
+        else:
+            return
+        passed.at_points = (light, *passed.at_points[:2])
+        self._light_points(placed, passed.at_points, chosen, view if self.apart else None, out)
 
     def _light_together(self, out: Radiance, view: NDArray[np.float32] | None) -> None:
-        """Exit radiance of the movers' points, of all reflections, into out."""
+        """Exit radiance of the movers' points, of all reflections, into out.
+
+        What an object reflects on itself is a reflection more. Of so many reflections that its share in the last of
+        them is nothing (ALL_ORDERS), all of it is taken."""
         placed, passed = self._where(), self._passed
         assert passed is not None
-        lights, late = self._lights(passed.reflected), ~placed.early
-        with self._step("reflections"):
-            put_reflections(passed.rows, placed.entities, placed.lookup, lights, threads=self.threads, wanted=late)
-        self._light_points(placed, passed.rows, passed.behind, None, view, out)
+        lights = [self._all_light(placed, passed)]
+        if passed.before is not None:
+            lights += [self._all_light(placed, passed.before)] * self._asked_bounces
+        self._light_points(placed, lights, None, view, out)
         self._add_sunlight(out, slice(self.static, len(self)))
+
+    def _all_light(self, placed: Placement, passed: _Passed) -> F32:
+        """Light at all points of the movers, of all reflections so far."""
+        with self._step("reflections"):
+            put_reflections(
+                passed.rows,
+                placed.entities,
+                placed.lookup,
+                self._lights(passed.reflected),
+                threads=self.threads,
+                wanted=~placed.early,
+            )
+        return self._at(placed, placed.points, passed.rows, passed.behind, spread=self._sites.spread)
 
     def _light_points(
         self,
         placed: Placement,
-        rows: F32,
-        behind: F32,
+        lights: Sequence[F32],
         chosen: NDArray[np.int64] | None,
         view: NDArray[np.float32] | None,
         out: Radiance,
     ) -> None:
-        """Exit radiance of the movers' points, or of the chosen receivers of theirs (rising), into out."""
-        start, spread = placed.points.start - self.static, self._sites.spread
-        if chosen is None:
-            light = self._at(placed, placed.points, rows, behind, spread=spread)
-        else:
-            own = chosen - self.static
-            some = Between(spread.site[own], spread.weight[own])
-            light = self._at(placed, chosen + start, rows, behind, spread=some)
+        """Exit radiance of the movers' points, or of the chosen receivers of theirs (rising), into out; lights: at
+        them, see `shade.diffuse_by_order`. In a picture of all reflections together, without a light for what the
+        object has reflected itself, that counts with the light that fell on it."""
         shine = out.specular
+        whole = not self.apart and chosen is None and self._asked_bounces >= ALL_ORDERS
         for mover, entity in zip(self.movers, placed.entities, strict=False):
             receivers, turn = mover.receivers, entity.turn(self.order)
             where: slice | NDArray[np.int64] = mover.rows
-            part = light[mover.rows.start - self.static : mover.rows.stop - self.static]
+            own = slice(mover.rows.start - self.static, mover.rows.stop - self.static)
             if chosen is not None:
                 a, b = np.searchsorted(chosen, [mover.rows.start, mover.rows.stop])
-                where, part = chosen[a:b], light[a:b]
-                receivers = receivers._replace(to_diffuse=receivers.to_diffuse[where - mover.rows.start])
-            out.diffuse[where] = never_negative(diffuse(receivers, part, turn, self.threads))[0]
+                where, own = chosen[a:b], slice(int(a), int(b))
+                receivers = receivers.at(where - mover.rows.start)
+            parts = [light[own] for light in lights]
+            if whole:
+                found = diffuse(receivers, parts[0], turn, self.threads)
+            else:
+                found = diffuse_by_order(receivers, parts, turn, self.threads)
+            out.diffuse[where] = never_negative(found)[0]
             if shine is None or chosen is not None:
                 continue
             shine[mover.rows] = 0.0
             if mover.body.terms > 1 and view is not None:
                 towards = np.ascontiguousarray(view[mover.rows] @ entity.rotation, np.float32)
-                lit = specular(receivers, part, turn, towards, mover.body.lobe, mover.colour, self.threads)
+                lit = specular(receivers, parts[0], turn, towards, mover.body.lobe, mover.colour, self.threads)
                 shine[mover.rows] = never_negative(lit)[0]
 
     def _exact_specular(
@@ -518,6 +552,10 @@ class MovingStore(LightingStore):
         assert passed is not None
         rows = placed.work
         wanted = None if self.apart else placed.early
+        passed.number += 1
+        if not self.apart and passed.number == self._asked_bounces < ALL_ORDERS:
+            kept = passed.reflected.copy(), passed.behind.copy(), passed.rows.copy()
+            passed.before = _Passed(passed.at_proxies, *kept)
         lights = self._lights(passed.at_proxies)
         passed.reflected += passed.at_proxies
         with self._step("reflections"):

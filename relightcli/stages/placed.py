@@ -16,7 +16,7 @@ from relightcli.core.fields.body import Body, axes
 from relightcli.core.fields.entities import Entity, Surroundings, of_light
 from relightcli.core.fields.interpolate import make_grid
 from relightcli.core.fields.shade import Receivers
-from relightcli.core.fields.standing import Between, between
+from relightcli.core.fields.sites import Between, between, outlook, spread_out
 from relightcli.core.shade.low_order import response
 from relightcli.core.sphere.rotation import rotation_matrices
 from relightcli.errors import InputError
@@ -93,7 +93,7 @@ class Mover:
             made_for=material,
             body=self.body._replace(lobe=lobe),
             own=replace(self.own, transfer=Scaled(kept.transfer, factor.astype(np.float32))),
-            receivers=self.receivers._replace(to_diffuse=kept.self_diffuse * np.array(material.diffuse, np.float32)),
+            receivers=_dyed(self.receivers, kept.self_by_order, material),
             colour=row[SPECULAR : SPECULAR + 3].astype(np.float32),
         )
 
@@ -157,7 +157,8 @@ def _read_object(
         kept.proxies,
     )
     colour = pack_materials([material]).parameters[0, SPECULAR : SPECULAR + 3].astype(np.float32)
-    chosen = np.unique(np.linspace(0, len(body.point) - 1, SITES).astype(int))
+    outlooks = outlook(body.point, body.normal, body.radius)
+    chosen = spread_out(outlooks, SITES)
     on_surface = body.point[chosen]
     sites = np.concatenate([kept.proxies, on_surface + INWARDS * (body.center - on_surface)])
     coated = material.adjustable and body.terms > 1
@@ -173,16 +174,17 @@ def _read_object(
         _receivers(body, kept, material, any_albedo),
         colour,
         sites,
-        between(body.point, on_surface),
+        between(outlooks, outlooks[chosen]),
     )
 
 
 def _receivers(body: Body, kept: KeptField, material: Material, any_albedo: bool) -> Receivers:
     """What the points make of light; their texture acts in the picture."""
-    of_white = kept.self_diffuse
+    of_white = kept.self_by_order
     if any_albedo:
-        of_white = of_white @ self_weights(material.diffuse).astype(np.float32)
-    to_diffuse = of_white * np.array(material.diffuse, np.float32)
+        weights = self_weights(material.diffuse).astype(np.float32)
+        parts = np.split(of_white, [1, 1 + len(weights)], axis=2)
+        of_white = np.concatenate([parts[0], parts[1] @ weights, parts[2] @ weights], axis=2)
     to_frame = np.zeros((0, body.order**2, body.order**2, 1), np.float32)
     if kept.self_whole is not None:
         to_frame = np.empty_like(kept.self_whole)
@@ -191,7 +193,15 @@ def _receivers(body: Body, kept: KeptField, material: Material, any_albedo: bool
             part = slice(a, a + _SLAB)
             turns = rotation_matrices(frames[part], body.order)
             to_frame[part] = np.einsum("pki,pijc->pkjc", turns, kept.self_whole[part])
-    return Receivers(to_diffuse, to_frame, body.normal)
+    none = np.zeros((0, body.order**2, 3), np.float32)
+    return _dyed(Receivers(none, to_frame, body.normal), of_white, material)
+
+
+def _dyed(receivers: Receivers, of_white: F32, material: Material) -> Receivers:
+    """With the diffuse colour of a material; of_white (P, N, 1 + 2 C), see `KeptField`."""
+    colour, colours = np.array(material.diffuse, np.float32), of_white.shape[2] // 2
+    parts = tuple(part * colour for part in np.split(of_white, [1, 1 + colours], axis=2))
+    return receivers._replace(to_diffuse=parts[0] + parts[1] + parts[2], by_order=parts)
 
 
 def read_lights(store: formats.Store, lights: dict[str, SphereLight | RectangleLight]) -> dict[str, Surroundings]:

@@ -12,7 +12,8 @@ from relightcli.adapters.rays import Tracer
 from relightcli.core.fields.chain import open_rows, passing
 from relightcli.core.fields.close import Close, add_samples, covered, look_close
 from relightcli.core.fields.entities import Entity, Lookup, look_up, turn_together
-from relightcli.core.fields.standing import Between, Views, look_around, unhidden
+from relightcli.core.fields.sites import Between
+from relightcli.core.fields.standing import Views, look_around, unhidden
 from relightcli.core.shade.gather import Gather
 from relightcli.stages.placed import Mover
 

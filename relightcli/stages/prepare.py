@@ -264,5 +264,6 @@ def _both_sides(scene: Scene, geometry: Geometry) -> NDArray[np.bool_]:
 
 
 def _lobes(scene: Scene) -> bool:
-    """Whether any material has a specular lobe, or may be given one when a picture is made."""
-    return any(m.model not in ("lambert", "translucent") or m.adjustable for m in scene.materials.values())
+    """Whether any object's material has a specular lobe, or may be given one when a picture is made."""
+    used = [scene.materials[o.material] for o in scene.objects.values()]
+    return any(m.model not in ("lambert", "translucent") or m.adjustable for m in used)

@@ -23,7 +23,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from relightcli.core.fields.entities import Entity, Lookup, look_up, turn_together
-from relightcli.core.fields.standing import Between
+from relightcli.core.fields.sites import Between
 from relightcli.core.parts import in_parts
 from relightcli.core.sphere.triple_product import coefficients
 from relightcli.core.sphere.window import window

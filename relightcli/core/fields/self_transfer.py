@@ -38,11 +38,17 @@ _BLOCK = 1 << 16  # rays traced together
 
 class Solution(NamedTuple):
     """transfer (P, m, N, N, C) float32, coefficient i then j (`field.SelfTransfer`); exits (P, terms, m N C) float32,
-    e_b per light (k, j, colour); rays; noise: largest standard error of a point's blocked light, relative to even
-    light; rounds of the fixed point."""
+    e_b per light (k, j, colour)
+
+    by_order (P, N, 1 + 2 C) float64: diffuse exit radiance of points of albedo 1 per light about the object, A_l y_i(n)
+    / pi times their self transfer: without own reflections, the same in all colours, then what one of them adds, then
+    what all others add
+    rays; noise: largest standard error of a point's blocked light, relative to even light; rounds of the fixed point.
+    """
 
     transfer: NDArray[np.float32]
     exits: NDArray[np.float32]
+    by_order: NDArray[np.float64]
     rays: int
     noise: float
     rounds: int
@@ -61,12 +67,16 @@ def solve(tracer: Tracer, body: Body, proxies: NDArray[np.float64], tolerance: f
     first = np.ascontiguousarray(np.broadcast_to(open_, shape), np.float32).reshape(len(weights), n, lights)
     received = first
     exits = _exit(body, operator, turn, received)
+    opened = np.einsum("pi,pij->pj", operator, np.eye(n) - hidden)
+    once = np.zeros((len(weights), n, body.colours))
     rounds = 0
     if (found.point[:, 0] >= 0).any():
         change = largest = float(np.abs(exits).max())
         while change > CONVERGED * largest:
             rounds += 1
             received = first + gather(found, harmonics, exits, body, frames)
+            if rounds == 1:
+                once = _diffuse_part(operator, (received - first).reshape(shape))
             now = _exit(body, operator, turn, received)
             change, largest = float(np.abs(now - exits).max()), float(np.abs(now).max())
             exits = now
@@ -75,7 +85,16 @@ def solve(tracer: Tracer, body: Body, proxies: NDArray[np.float64], tolerance: f
                     f"self transfer: after {rounds} reflections light still changes by {change:.3g} of {largest:.3g}"
                 )
     transfer = np.ascontiguousarray(received.reshape(shape).transpose(0, 2, 1, 3, 4))
-    return Solution(transfer, exits, rays, noise, rounds)
+    rest = _diffuse_part(operator, (received - first).reshape(shape)) - once
+    by_order = np.concatenate([opened[..., None], once, rest], axis=2)
+    return Solution(transfer, exits, by_order, rays, noise, rounds)
+
+
+def _diffuse_part(operator: NDArray[np.float64], received: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Diffuse exit radiance (P, N, C) of points of albedo 1 per light about the object: of what they receive, (P, N, m,
+    N, C), the sum over the proxies."""
+    out: NDArray[np.float64] = np.einsum("pi,pijc->pjc", operator, received.sum(axis=2, dtype=np.float64))
+    return out
 
 
 def exits_of(body: Body, transfer: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -83,14 +102,6 @@ def exits_of(body: Body, transfer: NDArray[np.float32]) -> NDArray[np.float32]:
     received = transfer.transpose(0, 2, 1, 3, 4).reshape(len(transfer), body.order**2, -1)
     turn = local_rotations(body.normal, body.order) if body.terms > 1 else np.zeros((0, 1, 1))
     return _exit(body, diffuse_operator(body), turn, np.ascontiguousarray(received))
-
-
-def diffuse_part(body: Body, transfer: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Diffuse exit radiance (P, N, C) of points of albedo 1 per light about the object: A_l y_i(n) / pi times the sum
-    over the proxies of a self transfer (P, m, N, N, C)."""
-    whole = transfer.sum(axis=1, dtype=np.float64)
-    out: NDArray[np.float64] = np.einsum("pi,pijc->pjc", diffuse_operator(body), whole)
-    return out
 
 
 def _exit(

@@ -10,6 +10,7 @@ stored.) Points of what has no self transfer, T = 1, are lit by all that stands 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,11 +31,17 @@ _MANY = 16_384  # points: fewer are shaded sooner than shared out
 class Receivers(NamedTuple):
     """What points of one object, in its frame, make of light: to_diffuse (P, N, C) float32, so that B is its product
     with L; to_frame (P, N, N, C) float32: T, then into the point's own frame (see `body.axes`), none if nothing shines;
-    normal (P, 3) float32."""
+    normal (P, 3) float32; by_order: `to_diffuse` in parts, with no own reflection, with one, with more; none unless it
+    is needed."""
 
     to_diffuse: NDArray[np.float32]
     to_frame: NDArray[np.float32]
     normal: NDArray[np.float32]
+    by_order: tuple[NDArray[np.float32], ...] = ()
+
+    def at(self, points: slice | NDArray[np.int64]) -> Receivers:
+        """Some of the points, for diffuse light alone."""
+        return self._replace(to_diffuse=self.to_diffuse[points], by_order=tuple(part[points] for part in self.by_order))
 
 
 def make_receivers(
@@ -73,6 +80,17 @@ def diffuse(
     by = receivers.to_diffuse
     threads = threads if len(light) >= _MANY else 1
     in_parts(lambda a, b: _diffuse(by[a:b], light[a:b], back, out[a:b]), len(light), threads)
+    return out
+
+
+def diffuse_by_order(
+    receivers: Receivers, lights: Sequence[NDArray[np.float32]], turn: NDArray[np.float64], threads: int = 1
+) -> NDArray[np.float32]:
+    """The same of light that was reflected in all, on the object or elsewhere, as often as lights[0]: lights[k], (P, 3,
+    N), was reflected k times less before it came there. What was reflected more often on the object is left out."""
+    out = np.zeros((len(lights[0]), 3), np.float32)
+    for by, light in zip(receivers.by_order, lights, strict=False):
+        out += diffuse(receivers._replace(to_diffuse=by), light, turn, threads)
     return out
 
 

@@ -6,7 +6,7 @@ cell that is open sends
     Y_i = sum over the sky's texels t in it of flux_t y_i(w_t)
 
 whatever is smaller than a cell included. A blocked one sends the exit radiance of the corners of the face that was hit,
-times w y_i, w the cell's solid angle. Points between sites take the nearest of them, by inverse distance.
+times w y_i, w the cell's solid angle. Points between sites: see `sites`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from relightcli.core.brdf.separable import TERMS
 from relightcli.core.lights.environment import SkyCube
@@ -29,7 +28,6 @@ from relightcli.core.sphere import cube, sh
 from relightcli.core.transport.tracer import Tracer
 
 CELLS = 8  # along a face's side
-NEAREST = 4  # sites that a point takes light from
 
 
 class Views(NamedTuple):
@@ -242,37 +240,3 @@ def _unhidden(distance, directions, solid, sites, centers, radii, out):  # type:
                         hidden += solid[k]
             if total > 0.0:
                 out[s, e] = 1.0 - hidden / total
-
-
-class Between(NamedTuple):
-    """How points take what sites have: site (n, NEAREST) int64, weight (n, NEAREST) float32, rows summing to 1."""
-
-    site: NDArray[np.int64]
-    weight: NDArray[np.float32]
-
-    def blend(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Values (S, ...) float32 at the points, (n, ...)."""
-        flat = np.ascontiguousarray(values.reshape(len(values), -1))
-        out = np.zeros((len(self.site), flat.shape[1]), np.float32)
-        _blend(self.site, self.weight, flat, out)
-        return out.reshape(-1, *values.shape[1:])
-
-
-@njit(cache=True, nogil=True)
-def _blend(site, weight, values, out):  # type: ignore[no-untyped-def]
-    for i in range(len(site)):
-        for k in range(site.shape[1]):
-            w, own = weight[i, k], values[site[i, k]]
-            for j in range(len(own)):
-                out[i, j] += w * own[j]
-
-
-def between(points: NDArray[np.float64], sites: NDArray[np.float64]) -> Between:
-    """Weights of sites (S, 3) at points (n, 3), S > 0."""
-    distance, site = cKDTree(sites).query(points, k=min(NEAREST, len(sites)))
-    distance, site = distance.reshape(len(points), -1), site.reshape(len(points), -1)
-    # Relative to the nearest; 0 / 0 at a site itself, which has all of the weight.
-    first = distance[:, :1]
-    ratio = np.divide(first, distance, out=np.ones_like(distance), where=distance > 0.0) ** 2
-    weight = np.where(first > 0.0, ratio, (distance == 0.0).astype(np.float64))
-    return Between(site, (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from relightcli.core.fields.body import clamped_cosine, local_rotations
+from relightcli.core.fields.body import clamped_cosine, diffuse_operator, local_rotations
 from relightcli.core.fields.build import build_field, field_samples
 from relightcli.core.fields.field import shell_radii
 from relightcli.core.fields.proxies import place_proxies
@@ -72,6 +72,27 @@ def test_a_white_bowl_is_a_furnace_too():
     assert above.sum() >= 4
     total = reflected(field, even())[..., 0] + field.occlusion
     np.testing.assert_allclose(total[above], np.broadcast_to(even(), total[above].shape), atol=2e-5)
+
+
+def test_own_reflections_of_a_bowl_by_their_number():
+    """Every point of half a sphere sees the sky with half of its cosine, and the bowl with the other half. Its
+    irradiance / pi under even light is 1/2 without own reflections, one of them adds a/4, all together 1/2 / (1 - a/2).
+
+    The next band has 1/24 of the clamped cosine, which is 0.02 of a half; at a point comes three times the rays' noise
+    of 1 % of even light."""
+    for albedo in (0.3, 0.8):
+        body = bowl(grey(albedo), 8)
+        found = solve(tracer_of(body), body, place_proxies(body.point, 3))
+        middle = body.point[:, 1] < -0.3  # the rim's normals are level: its horizon cuts faces
+        opened, once, rest = (found.by_order.transpose(0, 2, 1) @ even())[middle].T
+        exact = 0.5, albedo / 4, 0.5 / (1 - albedo / 2) - 0.5 - albedo / 4
+        for part, wanted in zip((opened, once, rest), exact, strict=True):
+            np.testing.assert_allclose(part, wanted, atol=0.02 + 0.03)
+            np.testing.assert_allclose(part.mean(), wanted, atol=0.02)
+        whole = found.transfer.sum(1, dtype=np.float64)[..., 0]
+        np.testing.assert_allclose(
+            found.by_order.sum(2), np.einsum("pi,pij->pj", diffuse_operator(body), whole), atol=1e-6
+        )
 
 
 def test_the_field_of_a_ball_is_a_disc_at_every_distance():

@@ -16,7 +16,6 @@ from relightcli.core.fields.field import shell_radii
 from relightcli.core.fields.interpolate import make_grid
 from relightcli.core.fields.standing import (
     CELLS,
-    between,
     light_from_sky,
     light_from_surfaces,
     look_around,
@@ -91,21 +90,6 @@ def test_half_a_wall_hides_half():
     sites = np.zeros((1, 3))
     found = unhidden(views_of(half, sites), sites, np.array([[3.0, 0.0, 0.0]]), np.array([1.5]))
     assert found[0, 0] == pytest.approx(0.5, abs=0.01)
-
-
-def test_points_take_the_nearest_sites():
-    rng = np.random.default_rng(1)
-    sites, points = rng.random((20, 3)), rng.random((50, 3))
-    points[0] = sites[7]
-    spread = between(points, sites)
-    np.testing.assert_allclose(spread.weight.sum(axis=1), 1.0, atol=1e-6)
-    values = rng.random((20, 2)).astype(np.float32)
-    found = spread.blend(values)
-    np.testing.assert_allclose(found[0], values[7], atol=1e-6)
-    assert (found >= values.min(axis=0) - 1e-6).all()
-    assert (found <= values.max(axis=0) + 1e-6).all()
-    alone = between(points, sites[:1])
-    np.testing.assert_allclose(alone.blend(values[:1]), np.tile(values[0], (50, 1)))
 
 
 def test_sky_terms_hold_the_irradiance():
