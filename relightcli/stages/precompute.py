@@ -36,7 +36,7 @@ def precompute(config: Config) -> dict[str, Any]:
     run.need_scheduler(None if config.dry_run else config.scheduler)
     prepared = prepare(config, account)
     if config.dry_run:
-        return dry_run(prepared, account)
+        return dry_run(prepared, account, _settings(prepared))
     inputs = scene_inputs(scene := prepared.scene)
     need_unchanged(prepared.read)
     source, geometry, moving = prepared.source, prepared.geometry, prepared.moving
