@@ -28,6 +28,7 @@ from relightcli.stages.lay_out import make_job, put_scene
 from relightcli.stages.pose_job import choose_frames
 from relightcli.stages.precompute_config import Config
 from relightcli.stages.prepare import Prepared
+from relightcli.stages.promise import out_of_reach
 from relightcli.stages.receiver_setup import PixelReceivers
 from relightcli.stages.visibility_job import VisibilityJob, block_size, create_outputs
 
@@ -64,10 +65,13 @@ def dry_run(prepared: Prepared, account: Account, settings: dict[str, Any]) -> d
     seconds, cpu_seconds = (
         sum(cost[key] for cost in account.steps.values()) + start[key] for key in ("seconds", "cpu_seconds")
     )
+    notes = list(prepared.geometry.notes)
     if prepared.promise is not None:
         check = predict_check(config, prepared.scene, prepared.source, prepared.bounces, prepared.tried, light)
         seconds += check["seconds"]
         cpu_seconds += check["cpu_seconds"]
+        missed = out_of_reach(prepared.promise, prepared.tried)
+        notes += [] if missed is None else [f"{missed}: without --allow-miss nothing is simulated"]
     total = np.sum(list(spent.values()), axis=0)
     rows_of_plan = prepared.plan_rows()
     for row in rows_of_plan:
@@ -88,7 +92,7 @@ def dry_run(prepared: Prepared, account: Account, settings: dict[str, Any]) -> d
             "cpu_seconds": float(cpu_seconds + total[3]),
             "bytes": int(scene_bytes + total[2]),
         },
-        "notes": list(prepared.geometry.notes),
+        "notes": notes,
     }
 
 

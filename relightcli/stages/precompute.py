@@ -20,7 +20,7 @@ from relightcli.stages.lay_out import make_job, put_scene
 from relightcli.stages.pose_job import simulate_poses
 from relightcli.stages.precompute_config import Config
 from relightcli.stages.prepare import Prepared, prepare
-from relightcli.stages.promise import keep_promise, keep_promise_moving
+from relightcli.stages.promise import keep_promise, keep_promise_moving, need_reach
 from relightcli.stages.promise_moving import choose_fields
 from relightcli.stages.visibility_job import block_size, create_outputs
 
@@ -51,6 +51,8 @@ def precompute(config: Config) -> dict[str, Any]:
     if writer is None:
         return {"store": str(config.output), "status": "up to date", "notes": list(geometry.notes)}
     with writer:
+        if prepared.promise is not None:
+            need_reach(prepared.config, prepared.promise, scene, prepared.tried, prepared.finer_helps)
         resumed = bool(writer.done)
         with account.step("receivers"):
             receivers, buried, starts = prepared.receivers()

@@ -145,6 +145,36 @@ def choose(tried: list[Tried], promise: float) -> Tried:
     return next(one for one in tried if one.error.share <= most)
 
 
+def need_reach(config: Config, promise: float, scene: Scene, tried: Sequence[Tried], finer_helps: bool) -> None:
+    """Raises NumericalError where direct light alone misses the tolerance beyond doubt, with all that was tried."""
+    missed = out_of_reach(promise, tried)
+    if missed is not None and not config.allow_miss:
+        knob = _sharper(config, scene, tried[-1].resolution, finer_helps)
+        raise NumericalError(
+            f"{config.output}: {missed}. What would help: {knob}. Nothing was simulated; the same command with "
+            "--allow-miss does it as it is"
+        )
+
+
+def out_of_reach(promise: float, tried: Sequence[Tried]) -> str | None:
+    """What there is to say of direct light that misses the tolerance, by a lower bound; None where it may keep it."""
+    best = min((one.error for one in tried), key=lambda error: error.least, default=None)
+    if best is None or best.least <= promise:
+        return None
+    return f"direct light alone errs by {best.share:.2%} ({best.where}), more than the tolerance of {promise:.2%}"
+
+
+def _sharper(config: Config, scene: Scene, resolution: int, finer_helps: bool) -> str:
+    """The option that brings the error of direct light down."""
+    if config.receivers == "vertices":
+        return f"--receivers pixels:{next(iter(scene.cameras), 'CAMERA')}, or a finer mesh"
+    if resolution < RESOLUTIONS[-1] and finer_helps:
+        return f"--light-resolution {2 * resolution}"
+    grid = config.grid + 1
+    finer = f"--pixel-grid {grid}" if grid <= MOST_PIXEL_GRID else "a larger picture"
+    return finer + (f" or --light-resolution {2 * resolution}" if finer_helps else "")
+
+
 def keep_promise_moving(config: Config, promise: float, scene: Scene, source: Geometry, writer: formats.Writer) -> None:
     """`keep_promise` where objects may be moved."""
     found = check_moved(config, promise, scene, source, writer)
@@ -196,14 +226,8 @@ def keep_promise(
     direct = judge.error(lighting, strips, skies, 0, 0, None, DIRECT * promise)
     if direct.share <= DIRECT * promise:
         knob = f"--bounces {bounces + 1}, a finer --bounce-resolution, or a finer mesh to bounce light off"
-    elif config.receivers == "vertices":
-        knob = f"--receivers pixels:{next(iter(scene.cameras), 'CAMERA')}, or a finer mesh"
-    elif resolution < RESOLUTIONS[-1] and finer_helps:
-        knob = f"--light-resolution {2 * resolution}"
     else:
-        grid = config.grid + 1
-        finer = f"--pixel-grid {grid}" if grid <= MOST_PIXEL_GRID else "a larger picture"
-        knob = finer + (f" or --light-resolution {2 * resolution}" if finer_helps else "")
+        knob = _sharper(config, scene, resolution, finer_helps)
     raise NumericalError(
         f"{config.output}: the error is {found.share:.2%} ({found.where}; of direct light {direct.share:.2%}), more "
         f"than the tolerance of {promise:.2%}. What would help: {knob}. The work is kept in "
