@@ -66,10 +66,11 @@ def dry_run(prepared: Prepared, account: Account, settings: dict[str, Any]) -> d
         sum(cost[key] for cost in account.steps.values()) + start[key] for key in ("seconds", "cpu_seconds")
     )
     notes = list(prepared.geometry.notes)
-    if prepared.promise is not None:
+    if prepared.checked:
         check = predict_check(config, prepared.scene, prepared.source, prepared.bounces, prepared.tried, light)
         seconds += check["seconds"]
         cpu_seconds += check["cpu_seconds"]
+    if prepared.promise is not None:
         missed = out_of_reach(prepared.promise, prepared.tried)
         notes += [] if missed is None else [f"{missed}: without --allow-miss nothing is simulated"]
     total = np.sum(list(spent.values()), axis=0)
@@ -109,7 +110,7 @@ def _pilot(
     blocks = -(-count // block_size(job.resolution))
     create_outputs(writer, job, count, RUN)
     begun, processes, others, none = Meter(), 1, 0.0, None
-    if prepared.promise is not None and prepared.moving is None:
+    if prepared.checked and prepared.moving is None:
         asked = (writer, prepared.config, prepared.scene, prepared.source, prepared.bounces)
         measure_light(*asked)  # loads kernels, as every run has to
         start = begun.read()

@@ -103,10 +103,10 @@ def precompute(config: Config) -> dict[str, Any]:
                     config.quiet,
                     config.scheduler,
                 )
-        if prepared.promise is not None and moving is not None:
+        if prepared.checked and prepared.promise is not None and moving is not None:
             with account.step("check"):
                 keep_promise_moving(config, prepared.promise, scene, source, writer)
-        elif prepared.promise is not None:
+        elif prepared.checked and prepared.promise is not None:
             with account.step("check"):
                 keep_promise(
                     prepared.config,
