@@ -56,7 +56,7 @@ from relightcli.cli import options
     "is taken, whatever --model and --lobes say. Default: that of a store made with one.",
 )
 @click.option("--allow-miss", is_flag=True, help="Keep the store where its error is larger than the tolerance.")
-@click.option("--dry-run", is_flag=True, help="Say what would be made; do nothing.")
+@click.option("--dry-run", is_flag=True, help="Say what would be made and what it should cost; do nothing.")
 @options.no_seed
 @options.workers
 @options.scheduler
@@ -90,6 +90,7 @@ def _text(result: dict[str, Any]) -> str:
             f"{o['object']}: {o['frames']} frames of {o['vertices']} vertices, {o['coefficients']} coefficients each"
             for o in result["objects"]
         ]
+        lines.append(options.predicted_text(result))
     elif result["status"] == "up to date":
         lines.append(f"{result['store']} is up to date")
     else:

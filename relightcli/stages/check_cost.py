@@ -74,12 +74,13 @@ def _light(lighting: LightingStore, scene: Scene, sky: Sky, eye: np.ndarray, bou
 
 
 def predict_check(
-    config: Config, scene: Scene, source: Geometry, bounces: int, tried: Sequence[Tried], light: LightCosts | None
+    only: str | None, scene: Scene, source: Geometry, bounces: int, tried: Sequence[Tried], light: LightCosts | None
 ) -> Costs:
     """seconds and cpu_seconds that the check will take: to trace, as often as it took for what was tried; for light
-    reflected once, what that took there, if anything was tried; for the rest as `light` has it."""
+    reflected once, what that took there, if anything was tried; for the rest as `light` has it. only: the camera of a
+    store of pixels."""
     judge = Judge(scene, source, Tracer(source.positions, source.faces))
-    cameras, skies = check_views(scene, source, camera_of(config)), check_skies()
+    cameras, skies = check_views(scene, source, only), check_skies()
     middle = cameras[0].size[1] // 2
     rows = (max(0, middle - STRIP // 2), middle + max(1, STRIP // 2))
     meter = Meter()

@@ -28,7 +28,7 @@ from relightcli.stages.lay_out import make_job, put_scene
 from relightcli.stages.pose_job import choose_frames
 from relightcli.stages.precompute_config import Config
 from relightcli.stages.prepare import Prepared
-from relightcli.stages.promise import out_of_reach
+from relightcli.stages.promise import camera_of, out_of_reach
 from relightcli.stages.receiver_setup import PixelReceivers
 from relightcli.stages.visibility_job import VisibilityJob, block_size, create_outputs
 
@@ -67,7 +67,9 @@ def dry_run(prepared: Prepared, account: Account, settings: dict[str, Any]) -> d
     )
     notes = list(prepared.geometry.notes)
     if prepared.checked:
-        check = predict_check(config, prepared.scene, prepared.source, prepared.bounces, prepared.tried, light)
+        check = predict_check(
+            camera_of(config), prepared.scene, prepared.source, prepared.bounces, prepared.tried, light
+        )
         seconds += check["seconds"]
         cpu_seconds += check["cpu_seconds"]
     if prepared.promise is not None:

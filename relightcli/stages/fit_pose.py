@@ -15,22 +15,22 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import asdict
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 import relight_formats as formats
 from relightcli import __version__
 from relightcli.adapters.files import need_output
-from relightcli.core.pose.pose_model import MODELS, Errors, PoseModel, Report, Settings, fit_model
+from relightcli.core.pose.pose_model import MODELS, Errors, Report
 from relightcli.core.pose.zh_lobes import MOST_LOBES
-from relightcli.errors import InputError, NumericalError, StoreError
-from relightcli.run.accounting import Account, Meter
+from relightcli.errors import InputError, StoreError
+from relightcli.run.accounting import Account
 from relightcli.stages.budget import summary
 from relightcli.stages.cluster import copy_arrays
+from relightcli.stages.measured_error import Draft
+from relightcli.stages.pose_cost import predict_fit
+from relightcli.stages.pose_fits import LEFT_OUT, SIZES, Fit, fit_object, lit_sides, put_arrays
+from relightcli.stages.pose_fits import Config as Config
 from relightcli.stages.promise_pose import (
     CHOSEN,
     TRIAL,
@@ -42,30 +42,6 @@ from relightcli.stages.promise_pose import (
 )
 
 KIND = "pose"
-LEFT_OUT = ("visibility", "joint_matrix")  # of an object's training data
-# What --tolerance chooses from, the smallest first.
-SIZES = (("lobes", 1), ("lobes", 2), ("sh", 0))
-
-
-@dataclass(frozen=True)
-class Config:
-    """Everything that `fit-pose` needs to know. tolerance: relative RMS error of radiance that picks model and lobes;
-    None for the store's, if it has one, else to take those given."""
-
-    store: Path
-    output: Path
-    model: str = "lobes"
-    lobes: int = 2
-    axes: str = "log"
-    weight: str = "none"
-    ridge: float | None = None
-    components: int = Settings.components
-    tolerance: float | None = None
-    allow_miss: bool = False
-    workers: int = 1
-    overwrite: bool = False
-    dry_run: bool = False
-    quiet: bool = False
 
 
 def fit_pose(config: Config) -> dict[str, Any]:
@@ -83,7 +59,8 @@ def fit_pose(config: Config) -> dict[str, Any]:
             "and the effect pose, which goes with --receivers vertices."
         )
     if config.dry_run:
-        return {"dry_run": True, "objects": [_size(store, k, about) for k, about in poses.items()], "notes": []}
+        told = {"dry_run": True, "objects": [_size(store, k, about) for k, about in poses.items()], "notes": []}
+        return {**told, "predicted": predict_fit(config, store, _tolerance(config, store)).as_json(account)}
     tolerance = _tolerance(config, store)
     kept = ("model", "lobes", "axes", "weight", "ridge", "components")
     asked = {**{key: getattr(config, key) for key in kept}, "tolerance": tolerance}
@@ -108,7 +85,7 @@ def fit_pose(config: Config) -> dict[str, Any]:
             chosen = _chosen(config, tolerance, store, writer, judge)
             for k, about in poses.items():
                 if f"fit/{k}" not in writer.done:
-                    _put(writer, k, about, chosen[k] if k in chosen else _fit(config, store, k, about, None))
+                    _put(writer, k, chosen[k] if k in chosen else fit_object(config, store, k, about, None))
         known = {block["id"].split("/")[1]: block for block in writer.blocks if block["id"].startswith("fit/")}
         writer.set_attrs({"pose_models": {k: known[k]["model"] for k in poses}})
         if tolerance is not None:
@@ -150,80 +127,26 @@ def _tolerance(config: Config, store: formats.Store) -> float | None:
     return tolerance
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """A model of one object: what the store says of it, the report, what it cost, and its arrays by name."""
-
-    about: dict[str, Any]
-    report: Report
-    cost: dict[str, Any]
-    arrays: dict[str, NDArray[Any]]
-
-
 def _chosen(
     config: Config, tolerance: float | None, store: formats.Store, writer: formats.Writer, judge: PoseJudge
-) -> dict[str, _Fit]:
+) -> dict[str, Fit]:
     """The smallest models whose pictures keep the tolerance, else those as good as any, by object's number; none where
     there is no tolerance, or all were chosen before an interruption."""
     poses: dict[str, Any] = store.attrs["poses"]
     if tolerance is None or all(f"fit/{k}" in writer.done for k in poses):
         return {}
-    places = poses_between(writer, TRIAL)
-    tried: list[dict[str, _Fit]] = []
+    places = poses_between(Draft(writer), TRIAL)
+    tried: list[dict[str, Fit]] = []
     shares: list[float] = []
     for size in SIZES:
-        fits = {k: _fit(config, store, k, about, size) for k, about in poses.items()}
+        fits = {k: fit_object(config, store, k, about, size) for k, about in poses.items()}
         arrays = {f"pose/{k}/model/{name}": array for k, fit in fits.items() for name, array in fit.arrays.items()}
-        draft = Fitted(writer, arrays, {k: fit.about for k, fit in fits.items()})
+        draft = Fitted(Draft(writer), arrays, {k: fit.about for k, fit in fits.items()})
         tried.append(fits)
         shares.append(judge.trial(draft, places, tolerance).share)
         if shares[-1] <= CHOSEN * tolerance:
             break
     return tried[smallest(shares, tolerance)]
-
-
-def _fit(config: Config, store: formats.Store, k: str, about: dict[str, Any], size: tuple[str, int] | None) -> _Fit:
-    """The model of an object that was asked for, or of that kind and number of lobes."""
-    meter = Meter()
-    read: Any = store.read
-    features: NDArray[np.float64] = read(f"pose/{k}/features")
-    visibility: NDArray[np.float32] = read(f"pose/{k}/visibility").astype(np.float32)
-    clip: NDArray[np.int32] = read(f"pose/{k}/clip")
-    sides = _sides(store, k, about)
-    kind, lobes = size or (config.model, config.lobes)
-    chosen = Settings(kind, max(1, lobes), config.axes, config.weight, config.ridge, config.components)
-    try:
-        model, report = fit_model(features, visibility, clip, chosen, config.workers)
-    except ValueError as error:
-        raise NumericalError(f"{config.store}: pose/{k} of {about['object']!r}: {error}") from None
-    told = {
-        "object": about["object"],
-        "model": chosen.kind,
-        "lobes": chosen.lobes if chosen.kind == "lobes" else 0,
-        "axes": chosen.axes,
-        "weight": chosen.weight,
-        "order": model.order,
-        "sides": sides,
-        "ridge": report.ridge,
-        "rank": report.rank,
-        "components": report.components,
-        "gap": report.gap,
-    }
-    cost = {**meter.read(), "frames": len(features), "vertices": visibility.shape[1] // sides}
-    return _Fit(told, report, cost, _arrays(model))
-
-
-def _arrays(model: PoseModel) -> dict[str, NDArray[Any]]:
-    """What the store has of a model, by name."""
-    codes, scale = formats.quantise(model.slope, "int8", axis=2)
-    return {
-        "intercept": model.intercept.astype(np.float32),
-        "slope": codes,
-        "slope_scale": scale,
-        "centre": model.centre.astype(np.float32),
-        "pose_mean": model.mean,
-        "pose_direction": model.directions,
-    }
 
 
 def _report(told: dict[str, Any]) -> Report:
@@ -232,28 +155,14 @@ def _report(told: dict[str, Any]) -> Report:
     return Report(**{**told, "training": Errors(**told["training"]), "held_out": held_out})
 
 
-DIMS = {
-    "intercept": ("vertex_side", "number"),
-    "slope": ("vertex_side", "number", "component"),
-    "slope_scale": ("vertex_side", "number", "one_component"),
-    "centre": ("vertex_side", "lobe", "axis"),
-    "pose_mean": ("feature",),
-    "pose_direction": ("feature", "component"),
-}
-
-
-def _put(writer: formats.Writer, k: str, about: dict[str, Any], fit: _Fit) -> None:
-    group = f"pose/{k}/model"
-    for name, dims in DIMS.items():
-        attrs = {"scale": f"{group}/slope_scale"} if name == "slope" else None
-        codec: Any = "zstd" if dims[0] == "vertex_side" else "lz4"
-        writer.put(f"{group}/{name}", fit.arrays[name], dims=dims, attrs=attrs, codec=codec)
+def _put(writer: formats.Writer, k: str, fit: Fit) -> None:
+    put_arrays(writer, f"pose/{k}/model", fit.arrays)
     writer.record(f"fit/{k}", {**fit.cost, "model": fit.about, "report": asdict(fit.report)})
 
 
 def _size(store: formats.Store, k: str, about: dict[str, Any]) -> dict[str, Any]:
     frames, rows, coefficients = store.layouts[f"pose/{k}/visibility"].shape
-    sides = _sides(store, k, about)
+    sides = lit_sides(store, k, about)
     return {
         "object": about["object"],
         "frames": frames,
@@ -261,18 +170,6 @@ def _size(store: formats.Store, k: str, about: dict[str, Any]) -> dict[str, Any]
         "sides": sides,
         "coefficients": coefficients,
     }
-
-
-def _sides(store: formats.Store, k: str, about: dict[str, Any]) -> int:
-    """At how many sides an object's vertices were traced: 1, or 2 where its back is lit too."""
-    sides, rows = about.get("sides"), store.layouts[f"pose/{k}/visibility"].shape[1]
-    vertices = store.layouts[f"pose/{k}/rig/position"].shape[0]
-    if sides not in (1, 2) or rows != sides * vertices:
-        raise StoreError(
-            f"{store.path}: pose/{k}/visibility: expected rows for 1 or 2 sides (poses.{k}.sides) of {vertices} "
-            f"vertices, found {rows} rows and {sides!r} sides. Precompute it again."
-        )
-    return int(sides)
 
 
 def _summary(config: Config, started: float, resumed: bool) -> dict[str, Any]:

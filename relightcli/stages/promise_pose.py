@@ -38,18 +38,26 @@ TRIAL = ((0.3, 0.5), (0.8, 0.5))
 CHECK = ((0.1, 0.35), (0.55, 0.65))
 
 
-class Fitted(Draft):
-    """A pose store that is still being written, with models that are not in it yet. arrays: by name; about: the root
-    attribute `pose_models`."""
+class Fitted:
+    """A store, unfinished or not, with models that are not in it. arrays: by name; about: the root attribute
+    `pose_models`."""
 
-    def __init__(self, writer: formats.Writer, arrays: dict[str, NDArray[Any]], about: dict[str, Any]) -> None:
-        super().__init__(writer)
-        self.attrs = {**writer.attrs, "pose_models": about}
-        self.arrays = arrays
-        self.read = self._read
+    def __init__(self, base: Draft | formats.Store, arrays: dict[str, NDArray[Any]], about: dict[str, Any]) -> None:
+        self._base, self._arrays = base, arrays
+        self.attrs = {**base.attrs, "pose_models": about}
 
-    def _read(self, name: str) -> NDArray[Any]:
-        return self.arrays[name] if name in self.arrays else self.writer.read(name)
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._base, name)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._base
+
+    def read(self, name: str) -> NDArray[Any]:
+        found: Any = self._arrays[name] if name in self._arrays else self._base.read(name)
+        return found  # type: ignore[no-any-return]
+
+
+Posable = Draft | Fitted | formats.Store
 
 
 @dataclass
@@ -61,7 +69,7 @@ class PoseJudge:
 
     def error(
         self,
-        store: Draft,
+        store: Posable,
         places: list[tuple[str, ...]],
         cameras: list[Camera] | None,
         skies: dict[str, Sky],
@@ -85,22 +93,23 @@ class PoseJudge:
                 worst = replace(found, where=f"{found.where}, {' '.join(poses)}")
         return worst
 
-    def trial(self, store: Draft, places: list[tuple[str, ...]], tolerance: float) -> Share:
+    def trial(self, store: Posable, places: list[tuple[str, ...]], tolerance: float) -> Share:
         """The error by which models are chosen."""
         scene = PoseStore(cast("formats.Store", store), self.threads).scene
         skies = {name: sky.radiance for name, sky in pilot.skies(False)}
         return self.error(store, places, list(scene.cameras.values())[:1] or None, skies, CHOSEN * tolerance)
 
 
-def poses_between(writer: formats.Writer, where: tuple[tuple[float, float], ...]) -> list[tuple[str, ...]]:
+def poses_between(store: Draft | formats.Store, where: tuple[tuple[float, float], ...]) -> list[tuple[str, ...]]:
     """Poses of all characters between neighbouring training frames of their clips; of clips of one frame, that frame.
 
     where: for each, the place among all gaps and in the gap, 0 to 1.
     """
-    lighting = PoseStore(cast("formats.Store", Draft(writer)), 1)
+    lighting = PoseStore(cast("formats.Store", store), 1)
     out: list[list[str]] = [[] for _ in where]
-    for k, about in writer.attrs["poses"].items():
-        clip, seconds = writer.read(f"pose/{k}/clip"), writer.read(f"pose/{k}/seconds")
+    read: Any = store.read
+    for k, about in store.attrs["poses"].items():
+        clip, seconds = read(f"pose/{k}/clip"), read(f"pose/{k}/seconds")
         order = np.lexsort((seconds, clip))
         clip, seconds = clip[order], seconds[order]
         gaps = np.flatnonzero(clip[1:] == clip[:-1])
@@ -125,7 +134,7 @@ def keep_pose_promise(
 ) -> None:
     """Measures the error in poses that nothing was chosen by and keeps it with the store; raises NumericalError where
     it is more than the tolerance. reports: of the fits, by object's number."""
-    found = judge.error(Draft(writer), poses_between(writer, CHECK), None, check_skies(), tolerance)
+    found = judge.error(Draft(writer), poses_between(Draft(writer), CHECK), None, check_skies(), tolerance)
     measured: dict[str, Any] = {"share": found.share, "where": found.where, "tolerance": tolerance}
     if np.isfinite(found.bound):
         measured["bound"] = found.bound

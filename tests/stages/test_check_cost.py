@@ -55,7 +55,7 @@ def test_every_picture_of_the_check_has_the_light_of_interreflections(config, mo
     prepared = prepare(config, Account())
     tried = [Tried(16, 1, NOTHING, both(0.25), 1.0)]
     light = LightCosts(both(100.0), both(3.0), both(7.0))
-    asked = (config, prepared.scene, prepared.source, 2)
+    asked = (None, prepared.scene, prepared.source, 2)
     found = predict_check(*asked, tried, light)
     # The rest is the few microseconds that the mocked tracing takes.
     assert found["seconds"] == pytest.approx(PICTURES * (0.25 + 3.0) + 7.0, abs=0.5)
