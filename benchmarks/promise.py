@@ -84,17 +84,12 @@ def _one(folder: Path, scene: BounceScene, tolerance: float, size: tuple[int, in
     for leftover in (store, store.with_name(store.name + ".partial")):
         shutil.rmtree(leftover, ignore_errors=True)
     # Faces stay whole: cut ones are ten times as many receivers, and half a day for forty stores.
-    asked = ("precompute", path, "-o", store, "--tolerance", str(tolerance), "--no-subdivide")
-    receivers, refused = "vertices", ""
-    try:
-        told = run_tool(*asked)[1]
-    except RuntimeError as error:
-        if "more than the tolerance" not in str(error):
-            raise
-        refused = str(error).partition(": ")[2].strip()
-        shutil.rmtree(store.with_name(store.name + ".partial"))
-        receivers = f"pixels:{JUDGE}"
-        asked = (*asked, "--receivers", receivers)
+    asked: tuple[str | Path, ...] = ("precompute", path, "-o", store, "--tolerance", str(tolerance), "--no-subdivide")
+    receivers, refused, told = "none", "", {}
+    for tried in ("vertices", f"pixels:{JUDGE}"):
+        if tried == "vertices" and _refused_before(folder, tolerance):
+            continue
+        asked = (*asked, "--receivers", tried)
         try:
             told = run_tool(*asked)[1]
         except RuntimeError as error:
@@ -102,7 +97,9 @@ def _one(folder: Path, scene: BounceScene, tolerance: float, size: tuple[int, in
                 raise
             refused = str(error).partition(": ")[2].strip()
             shutil.rmtree(store.with_name(store.name + ".partial"))
-            receivers = "none"
+        else:
+            receivers = tried
+            break
     one: dict[str, Any] = {"scene": scene.name, "tolerance": tolerance, "receivers": receivers, "refused": refused}
     one |= {"errors": {}, "predicted": {}, "seconds": 0.0, "bytes": 0}
     if receivers == "none":
@@ -117,6 +114,15 @@ def _one(folder: Path, scene: BounceScene, tolerance: float, size: tuple[int, in
         one["errors"][name] = _error(folder, store, name, sky, edit, spp)
     shutil.rmtree(store)
     return one
+
+
+def _refused_before(folder: Path, tolerance: float) -> bool:
+    """Whether a larger tolerance was refused at vertices already, so that this one need not be tried there."""
+    for other in TOLERANCES:
+        record = folder / f"{other:g}.json"
+        if other > tolerance and record.exists() and json.loads(record.read_text())["receivers"] != "vertices":
+            return True
+    return False
 
 
 def _settings(store: Path) -> dict[str, Any]:

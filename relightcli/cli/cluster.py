@@ -57,7 +57,7 @@ from relightcli.cli import options
 @click.option("--seconds", default=None, type=float, help="Lights: refine so long; the largest error is split first.")
 @click.option("--camera", default=None, help="Lights: the view for which specular lobes are kept.")
 @click.option("--seed", default=0, type=options.SEED, show_default=True, help="Seed of samples and first centres.")
-@click.option("--dry-run", is_flag=True, help="Say what would be made; do nothing.")
+@click.option("--dry-run", is_flag=True, help="Say what would be made and what it should cost; do nothing.")
 @options.workers
 @options.scheduler
 @options.overwrite
@@ -109,7 +109,7 @@ def _light_text(result: dict[str, Any]) -> str:
 
 def _text(result: dict[str, Any]) -> str:
     if result.get("dry_run"):
-        return f"{result['receivers']} receivers in {result['clusters']} clusters"
+        return f"{result['receivers']} receivers in {result['clusters']} clusters; {options.predicted_text(result)}"
     if result["status"] == "up to date":
         return f"{result['store']} is up to date"
     return (

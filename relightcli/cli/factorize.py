@@ -66,7 +66,7 @@ def _ranks(context: click.Context, parameter: click.Parameter, value: str | None
     help="Ranks of the tensors of BRDFs: reflectance, view, light. Default: 8,16,8 for cook-torrance, 6,16,8 for "
     "blinn-phong.",
 )
-@click.option("--dry-run", is_flag=True, help="Say what would be made; do nothing.")
+@click.option("--dry-run", is_flag=True, help="Say what would be made and what it should cost; do nothing.")
 @options.no_seed
 @options.workers
 @options.scheduler
@@ -96,7 +96,9 @@ def command(
 def _text(result: dict[str, Any]) -> str:
     lines = [f"note: {note}" for note in result["notes"]]
     if result.get("dry_run"):
-        lines.append(f"{result['receivers']} receivers in {result['clusters']} clusters")
+        lines.append(
+            f"{result['receivers']} receivers in {result['clusters']} clusters; {options.predicted_text(result)}"
+        )
     elif result["status"] == "up to date":
         lines.append(f"{result['store']} is up to date")
     else:

@@ -52,9 +52,11 @@ from relightcli.cli import options
     "--tolerance",
     default=None,
     type=float,
-    help="Relative error of held-out frames: take the smallest model within it, whatever --model and --lobes say.",
+    help="Relative RMS error of radiance to keep in poses between the frames learnt from: the smallest model that does "
+    "is taken, whatever --model and --lobes say. Default: that of a store made with one.",
 )
-@click.option("--dry-run", is_flag=True, help="Say what would be made; do nothing.")
+@click.option("--allow-miss", is_flag=True, help="Keep the store where its error is larger than the tolerance.")
+@click.option("--dry-run", is_flag=True, help="Say what would be made and what it should cost; do nothing.")
 @options.no_seed
 @options.workers
 @options.scheduler
@@ -88,6 +90,7 @@ def _text(result: dict[str, Any]) -> str:
             f"{o['object']}: {o['frames']} frames of {o['vertices']} vertices, {o['coefficients']} coefficients each"
             for o in result["objects"]
         ]
+        lines.append(options.predicted_text(result))
     elif result["status"] == "up to date":
         lines.append(f"{result['store']} is up to date")
     else:
@@ -97,5 +100,7 @@ def _text(result: dict[str, Any]) -> str:
                 f"{o['object']}: {o['vertices']} vertices, {options.bytes_text(o['bytes'])}, visibility errs by "
                 f"{o['training']['bands']:.1%} at training frames{seen}; {o['seconds']:.1f} s"
             )
+        if "measured_error" in result:
+            lines.append(f"pictures of poses between the training frames err by {result['measured_error']:.1%}")
         lines.append(f"{result['store']}: {options.bytes_text(result['bytes'])}, {result['seconds']:.1f} s")
     return "\n".join(lines)

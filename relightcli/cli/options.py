@@ -112,6 +112,12 @@ def tell(result: dict[str, Any], text: str, as_json: bool, quiet: bool) -> None:
         click.echo(text, err=True)
 
 
+def predicted_text(result: dict[str, Any]) -> str:
+    """What a dry run says of costs."""
+    cost = result["predicted"]
+    return f"predicted {cost['seconds']:.1f} s, {bytes_text(cost['bytes'])}"
+
+
 def bytes_text(count: float) -> str:
     """1234567 as '1.2 MB'."""
     for unit in ("B", "kB", "MB", "GB"):

@@ -25,6 +25,7 @@ from relightcli.run.accounting import Account, Meter
 from relightcli.stages.budget import summary
 from relightcli.stages.left_over import basis_tolerance, left_over, spend
 from relightcli.stages.lighting import LightingStore, need_still
+from relightcli.stages.tensor_cost import predict_cluster
 from relightcli.stages.transfer_setup import BLOCK, CELLS, TransferSetup, coarse_cells
 
 KIND = "clusters"
@@ -77,7 +78,11 @@ def cluster(config: Config) -> dict[str, Any]:
         "order": ORDER,
     }
     if config.dry_run:
-        return {"dry_run": True, "receivers": len(lighting), "clusters": clusters, "notes": []}
+        costs = predict_cluster(
+            lighting, clusters, tolerance, config.functions, config.seed, SAMPLE, ORDER, TERMS, SKETCH
+        )
+        told = {"dry_run": True, "receivers": len(lighting), "clusters": clusters, "notes": []}
+        return {**told, "predicted": costs.as_json(account)}
     writer = formats.begin(
         config.output,
         KIND,
@@ -165,24 +170,30 @@ def _need_bounces(lighting: LightingStore) -> None:
         )
 
 
+def make_like(store: formats.Store, writer: formats.Writer, name: str) -> Any:
+    """An array of that name, empty, as the store has it."""
+    layout = store.layouts[name]
+    codec: Any = layout.codec
+    source: Any = store.array(name)
+    attributes = dict(source.attrs)
+    units = attributes.pop("units")
+    return writer.array(
+        name,
+        shape=layout.shape,
+        dtype=layout.data_type,
+        chunks=layout.chunks,
+        dims=layout.dims,
+        units=None if units == "1" else units,
+        attrs=attributes,
+        codec=codec,
+    )
+
+
 def copy_arrays(store: formats.Store, writer: formats.Writer, names: list[str]) -> None:
     """Copies arrays as they are, a range of chunks at a time."""
     for name in names:
         source: Any = store.array(name)
-        layout = store.layouts[name]
-        codec: Any = layout.codec
-        attributes = dict(source.attrs)
-        units = attributes.pop("units")
-        target: Any = writer.array(
-            name,
-            shape=layout.shape,
-            dtype=layout.data_type,
-            chunks=layout.chunks,
-            dims=layout.dims,
-            units=None if units == "1" else units,
-            attrs=attributes,
-            codec=codec,
-        )
+        layout, target = store.layouts[name], make_like(store, writer, name)
         if f"copy/{name}" in writer.done:
             continue
         step = max(1, layout.chunks[0]) if layout.shape else 1

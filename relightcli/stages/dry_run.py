@@ -20,13 +20,15 @@ from relightcli import __version__
 from relightcli.core.transport.receivers import Receivers
 from relightcli.run import blocks as run
 from relightcli.run.accounting import Account, Meter, children_seconds
+from relightcli.scene.build import scene_to_json
 from relightcli.scene.model import Geometry
+from relightcli.stages.check_cost import LightCosts, measure_light, predict_check
 from relightcli.stages.fields import predict
 from relightcli.stages.lay_out import make_job, put_scene
 from relightcli.stages.pose_job import choose_frames
 from relightcli.stages.precompute_config import Config
 from relightcli.stages.prepare import Prepared
-from relightcli.stages.promise import predict_check
+from relightcli.stages.promise import camera_of, out_of_reach
 from relightcli.stages.receiver_setup import PixelReceivers
 from relightcli.stages.visibility_job import VisibilityJob, block_size, create_outputs
 
@@ -34,11 +36,11 @@ RUN, RUNS = 64, 10  # receivers of a run; runs that are traced
 PARTS = {"shadows": ("trace", "visibility/"), "lights": ("light", "lights/"), "one-bounce": ("bounce", "bounce/")}
 
 
-def dry_run(prepared: Prepared, account: Account) -> dict[str, Any]:
+def dry_run(prepared: Prepared, account: Account, settings: dict[str, Any]) -> dict[str, Any]:
     """The plan with its cost, predicted from a pilot: of the whole run, planning included.
 
-    Poses and fields: from the speed of rays, and uncompressed. Seconds are those of the clock, on the machine as it is;
-    cpu_seconds those of all processes, which others that use the machine change less.
+    settings: of the store. Poses and fields: from the speed of rays, and uncompressed. Seconds are those of the clock,
+    on the machine as it is; cpu_seconds those of all processes, which others that use the machine change less.
     """
     config = prepared.config
     with account.step("receivers"):
@@ -46,11 +48,15 @@ def dry_run(prepared: Prepared, account: Account) -> dict[str, Any]:
     points = receivers.points if isinstance(receivers, PixelReceivers) else receivers
     with tempfile.TemporaryDirectory(prefix="relightcli-") as folder:
         store = Path(folder) / "pilot.zarr"
-        with formats.begin(store, "transfer", settings={}, inputs={}, program=f"relightcli {__version__}") as writer:  # type: ignore[union-attr]
+        with formats.begin(
+            store, "transfer", settings=settings, inputs={}, program=f"relightcli {__version__}"
+        ) as writer:  # type: ignore[union-attr]
+            about = scene_to_json(prepared.scene, prepared.geometry)
+            writer.set_attrs({"scene": about, "nothing_blocks": not prepared.shadows})
             with account.step("scene"):
                 put_scene(writer, prepared, receivers, buried)
             scene_bytes = _bytes(writer.partial_path)
-            spent, start = _pilot(writer, prepared, receivers, starts)
+            spent, start, light = _pilot(writer, prepared, receivers, starts)
     if "pose" in prepared.simulated:
         spent["pose"] = _pose_cost(config, prepared.geometry, prepared.both, spent["shadows"])
     if prepared.moving is not None:
@@ -59,10 +65,16 @@ def dry_run(prepared: Prepared, account: Account) -> dict[str, Any]:
     seconds, cpu_seconds = (
         sum(cost[key] for cost in account.steps.values()) + start[key] for key in ("seconds", "cpu_seconds")
     )
-    if prepared.promise is not None:
-        check = predict_check(config, prepared.scene, prepared.source, prepared.bounces, prepared.tried)
+    notes = list(prepared.geometry.notes)
+    if prepared.checked:
+        check = predict_check(
+            camera_of(config), prepared.scene, prepared.source, prepared.bounces, prepared.tried, light
+        )
         seconds += check["seconds"]
         cpu_seconds += check["cpu_seconds"]
+    if prepared.promise is not None:
+        missed = out_of_reach(prepared.promise, prepared.tried)
+        notes += [] if missed is None else [f"{missed}: without --allow-miss nothing is simulated"]
     total = np.sum(list(spent.values()), axis=0)
     rows_of_plan = prepared.plan_rows()
     for row in rows_of_plan:
@@ -83,33 +95,42 @@ def dry_run(prepared: Prepared, account: Account) -> dict[str, Any]:
             "cpu_seconds": float(cpu_seconds + total[3]),
             "bytes": int(scene_bytes + total[2]),
         },
-        "notes": list(prepared.geometry.notes),
+        "notes": notes,
     }
 
 
 def _pilot(
     writer: formats.Writer, prepared: Prepared, receivers: Receivers | PixelReceivers, starts: tuple[int, ...]
-) -> tuple[dict[str, NDArray[np.float64]], dict[str, float]]:
-    """Rays, seconds of the clock, bytes and seconds of all processors by part of the visibility of all receivers; and
-    the seconds of both kinds until the first is traced."""
+) -> tuple[dict[str, NDArray[np.float64]], dict[str, float], LightCosts | None]:
+    """Rays, seconds of the clock, bytes and seconds of all processors by part of the visibility of all receivers; the
+    seconds of both kinds until the first is traced; and, where the error will be measured, those of light."""
     count, workers = len(receivers), max(1, prepared.config.workers)
     job = make_job(prepared, str(writer.partial_path), receivers, starts)
     spent = {name: np.zeros(4) for name in ("shadows", "one-bounce", *(["lights"] if job.lights else []))}
     if not count:
-        return spent, {"seconds": 0.0, "cpu_seconds": 0.0}
+        return spent, {"seconds": 0.0, "cpu_seconds": 0.0}, None
     blocks = -(-count // block_size(job.resolution))
-    begun, others = Meter(), 0.0
-    if blocks > 1 and workers > 1:  # in other processes, which have to start
-        before = children_seconds()
-        subprocess.run([sys.executable, "-c", f"import {VisibilityJob.__module__}"], check=True)
-        others = (children_seconds() - before) * min(workers, blocks)
     create_outputs(writer, job, count, RUN)
+    begun, processes, others, none = Meter(), 1, 0.0, None
+    if prepared.checked and prepared.moving is None:
+        asked = (writer, prepared.config, prepared.scene, prepared.source, prepared.bounces)
+        measure_light(*asked)  # loads kernels, as every run has to
+        start = begun.read()
+        none = measure_light(*asked)
+        begun = Meter()
+    else:
+        start = dict.fromkeys(("seconds", "cpu_seconds"), 0.0)
+    if blocks > 1 and workers > 1:  # in other processes, which have to start
+        before, processes = children_seconds(), min(workers, blocks)
+        subprocess.run([sys.executable, "-c", f"import {VisibilityJob.__module__}"], check=True)
+        others = (children_seconds() - before) * processes
     worker = job.open()
     runs = -(-count // RUN)
     chosen = np.unique(np.linspace(0, runs - 1, RUNS).round().astype(int))
     worker.run(run.Block("first", int(chosen[0]) * RUN, min(count, (int(chosen[0]) + 1) * RUN)))
-    start = begun.read()
-    start["cpu_seconds"] += others
+    first = begun.read()
+    start["seconds"] += first["seconds"]
+    start["cpu_seconds"] += processes * first["cpu_seconds"] + others  # each of them loads kernels
     traced = 0
     costs: dict[str, float] = {}
     for number in chosen:
@@ -134,7 +155,8 @@ def _pilot(
         spent["basis"] = np.array([0.0, share * costs["rest_seconds"], size, costs["rest_cpu_seconds"]])
     for cost in spent.values():
         cost *= count / traced
-    return spent, start
+    light = None if none is None else measure_light(*asked).grown(none, count / traced)
+    return spent, start, light
 
 
 def _bytes(folder: Path) -> int:

@@ -29,6 +29,14 @@ from relightcli.stages.cluster import copy_arrays
 from relightcli.stages.direct_tensors import put_direct
 from relightcli.stages.left_over import LeftOver, left_over
 from relightcli.stages.lighting import LightingStore
+from relightcli.stages.part_cost import Costs, copying, scratch, stored_bytes
+from relightcli.stages.tensor_cost import (
+    PilotSetup,
+    names_but,
+    predict_asset_check,
+    predict_bounce,
+    predict_direct,
+)
 from relightcli.stages.transfer_setup import COARSE, TransferSetup, coarse_cells, fit_receivers
 
 KIND = "asset"
@@ -90,7 +98,8 @@ def factorize(config: Config) -> dict[str, Any]:
     label: NDArray[np.int32] = read("cluster/label")
     clusters = int(label.max()) + 1
     if config.dry_run:
-        return {"dry_run": True, "receivers": len(lighting), "clusters": clusters, "notes": []}
+        told = {"dry_run": True, "receivers": len(lighting), "clusters": clusters, "notes": []}
+        return {**told, "predicted": _predict(config, lighting, left, label, bounces).as_json(account)}
     if config.brdf_ranks is not None:
         settings["brdf_ranks"] = list(config.brdf_ranks)
     writer = formats.begin(
@@ -110,11 +119,10 @@ def factorize(config: Config) -> dict[str, Any]:
         resumed = bool(writer.done)
         writer.set_attrs(store.attrs)
         with account.step("copying"):
-            copy_arrays(store, writer, [name for name in store.names() if name not in LEFT_OUT])
+            copy_arrays(store, writer, names_but(store, LEFT_OUT))
         with account.step("reading"):
             setup = TransferSetup(lighting, int(store.settings["functions"]), config.workers)
-        order = np.argsort(label, kind="stable")
-        start = np.concatenate([[0], np.cumsum(np.bincount(label, minlength=clusters))]).astype(np.int64)
+        order, start = _by_cluster(label)
         writer.put("cluster/receiver", order.astype(np.int32), dims=("receiver",))
         writer.put("cluster/start", start, dims=("boundary",))
         basis: NDArray[np.float32] = read("light/basis")
@@ -135,6 +143,47 @@ def factorize(config: Config) -> dict[str, Any]:
                 keep_asset_promise(writer, left.tolerance, lighting.bounces, config.workers, config.allow_miss)
         writer.commit(summary(account, started, resumed, config.workers, store))
     return _summary(config, started, resumed, notes)
+
+
+def _by_cluster(label: NDArray[np.int32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Receivers by cluster, and where each begins, (clusters + 1,)."""
+    counts = np.bincount(label, minlength=int(label.max()) + 1)
+    return np.argsort(label, kind="stable"), np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+
+
+def _predict(
+    config: Config, lighting: LightingStore, left: LeftOver | None, label: NDArray[np.int32], bounces: int
+) -> Costs:
+    """What the stage will take, but for opening the store."""
+    store, out = lighting.store, Costs()
+    read: Any = store.read
+    order, start = _by_cluster(label)
+    basis: NDArray[np.float32] = read("light/basis")
+    bands = int(store.settings["order"])
+    with scratch(KIND, store.settings, {}) as writer:
+        out.add(copying(store, names_but(store, LEFT_OUT), writer))
+        writer.put("cluster/receiver", order.astype(np.int32), dims=("receiver",))
+        writer.put("one_bounce/basis", basis, dims=("light_cell", "light"))
+        out.bytes += stored_bytes(writer, "cluster") + stored_bytes(writer, "one_bounce")
+        with out.timed():
+            setup = PilotSetup(lighting, int(store.settings["functions"]), config.workers)
+            ranks = _ranks(config, left, writer, setup, basis, order, start, bands if bounces else 0)
+    out.add(predict_direct(lighting, ranks.coefficients, config.brdf_ranks))
+
+    def first(writer: formats.Writer, order: NDArray[np.int64], start: NDArray[np.int64]) -> None:
+        _one_bounce(ranks, writer, setup, basis, order, start, bands)
+
+    def second(writer: formats.Writer, order: NDArray[np.int64], start: NDArray[np.int64]) -> None:
+        _two_bounces(ranks.eigenvectors, config.second_order, writer, setup, order, start, bands)
+
+    if bounces:
+        out.add(predict_bounce(lighting, "one_bounce", first, order, start))
+    if bounces > 1:
+        out.add(predict_bounce(lighting, "two_bounce", second, order, start))
+    out.add(setup.more)
+    if left is not None:
+        out.add(predict_asset_check(lighting, max(lighting.bounces, bounces)))
+    return out
 
 
 def _ranks(

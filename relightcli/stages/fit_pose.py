@@ -15,47 +15,33 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import asdict
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 import relight_formats as formats
 from relightcli import __version__
 from relightcli.adapters.files import need_output
-from relightcli.core.pose.pose_model import MODELS, PoseModel, Report, Settings, fit_model
+from relightcli.core.pose.pose_model import MODELS, Errors, Report
 from relightcli.core.pose.zh_lobes import MOST_LOBES
-from relightcli.errors import InputError, NumericalError, StoreError
-from relightcli.run.accounting import Account, Meter
+from relightcli.errors import InputError, StoreError
+from relightcli.run.accounting import Account
 from relightcli.stages.budget import summary
 from relightcli.stages.cluster import copy_arrays
+from relightcli.stages.measured_error import Draft
+from relightcli.stages.pose_cost import predict_fit
+from relightcli.stages.pose_fits import LEFT_OUT, SIZES, Fit, fit_object, lit_sides, put_arrays
+from relightcli.stages.pose_fits import Config as Config
+from relightcli.stages.promise_pose import (
+    CHOSEN,
+    TRIAL,
+    Fitted,
+    PoseJudge,
+    keep_pose_promise,
+    poses_between,
+    smallest,
+)
 
 KIND = "pose"
-LEFT_OUT = ("visibility", "joint_matrix")  # of an object's training data
-# What --tolerance chooses from, the smallest first.
-SIZES = (("lobes", 1), ("lobes", 2), ("sh", 0))
-
-
-@dataclass(frozen=True)
-class Config:
-    """Everything that `fit-pose` needs to know. tolerance: relative error of held-out frames that picks model and
-    lobes, None to take those given."""
-
-    store: Path
-    output: Path
-    model: str = "lobes"
-    lobes: int = 2
-    axes: str = "log"
-    weight: str = "none"
-    ridge: float | None = None
-    components: int = Settings.components
-    tolerance: float | None = None
-    workers: int = 1
-    overwrite: bool = False
-    dry_run: bool = False
-    quiet: bool = False
 
 
 def fit_pose(config: Config) -> dict[str, Any]:
@@ -73,10 +59,11 @@ def fit_pose(config: Config) -> dict[str, Any]:
             "and the effect pose, which goes with --receivers vertices."
         )
     if config.dry_run:
-        return {"dry_run": True, "objects": [_size(store, k, about) for k, about in poses.items()], "notes": []}
-    asked = {
-        key: getattr(config, key) for key in ("model", "lobes", "axes", "weight", "ridge", "components", "tolerance")
-    }
+        told = {"dry_run": True, "objects": [_size(store, k, about) for k, about in poses.items()], "notes": []}
+        return {**told, "predicted": predict_fit(config, store, _tolerance(config, store)).as_json(account)}
+    tolerance = _tolerance(config, store)
+    kept = ("model", "lobes", "axes", "weight", "ridge", "components")
+    asked = {**{key: getattr(config, key) for key in kept}, "tolerance": tolerance}
     writer = formats.begin(
         config.output,
         KIND,
@@ -93,12 +80,18 @@ def fit_pose(config: Config) -> dict[str, Any]:
         left_out = {f"pose/{k}/{name}" for k in poses for name in LEFT_OUT}
         with account.step("copying"):
             copy_arrays(store, writer, [name for name in store.names() if name not in left_out])
+        judge = PoseJudge(config.workers)
         with account.step("pose"):
+            chosen = _chosen(config, tolerance, store, writer, judge)
             for k, about in poses.items():
                 if f"fit/{k}" not in writer.done:
-                    _fit(config, store, writer, k, about)
-        kept = {block["id"].split("/")[1]: block for block in writer.blocks if block["id"].startswith("fit/")}
-        writer.set_attrs({"pose_models": {k: kept[k]["model"] for k in poses}})
+                    _put(writer, k, chosen[k] if k in chosen else fit_object(config, store, k, about, None))
+        known = {block["id"].split("/")[1]: block for block in writer.blocks if block["id"].startswith("fit/")}
+        writer.set_attrs({"pose_models": {k: known[k]["model"] for k in poses}})
+        if tolerance is not None:
+            with account.step("check"):
+                reports = {k: _report(known[k]["report"]) for k in poses}
+                keep_pose_promise(writer, tolerance, judge, reports, config.allow_miss)
         writer.commit(summary(account, started, resumed, config.workers, store))
     return _summary(config, started, resumed)
 
@@ -119,87 +112,57 @@ def _check(config: Config) -> None:
         raise InputError(f"--components: expected at least 1; found {config.components}")
 
 
-def _fit(config: Config, store: formats.Store, writer: formats.Writer, k: str, about: dict[str, Any]) -> None:
-    meter = Meter()
-    read: Any = store.read
-    features: NDArray[np.float64] = read(f"pose/{k}/features")
-    visibility: NDArray[np.float32] = read(f"pose/{k}/visibility").astype(np.float32)
-    clip: NDArray[np.int32] = read(f"pose/{k}/clip")
-    sides = _sides(store, k, about)
-    settings = Settings(config.model, config.lobes, config.axes, config.weight, config.ridge, config.components)
-    try:
-        chosen, model, report, met = _choose(config.tolerance, settings, features, visibility, clip, config.workers)
-    except ValueError as error:
-        raise NumericalError(f"{config.store}: pose/{k} of {about['object']!r}: {error}") from None
-    _put(writer, f"pose/{k}/model", model)
-    writer.record(
-        f"fit/{k}",
-        {
-            **meter.read(),
-            "frames": len(features),
-            "vertices": visibility.shape[1] // sides,
-            "model": {
-                "object": about["object"],
-                "model": chosen.kind,
-                "lobes": chosen.lobes if chosen.kind == "lobes" else 0,
-                "axes": chosen.axes,
-                "weight": chosen.weight,
-                "order": model.order,
-                "sides": sides,
-                "ridge": report.ridge,
-                "rank": report.rank,
-                "components": report.components,
-                "gap": report.gap,
-            },
-            "report": asdict(report),
-            "within_tolerance": met,
-        },
-    )
+def _tolerance(config: Config, store: formats.Store) -> float | None:
+    """The error to keep: what was asked for, else that of a store made with one.
+
+    Raises InputError where none can be promised.
+    """
+    own = store.settings.get("tolerance") if store.settings["basis"] == "visibility" else None
+    tolerance = config.tolerance if config.tolerance is not None else own
+    if tolerance is not None and "fields" in store.attrs:
+        raise InputError(
+            f"--tolerance: {config.store} also holds objects that may be moved, and no error is promised for the light "
+            "between these and characters; leave it out"
+        )
+    return tolerance
 
 
-def _choose(
-    tolerance: float | None,
-    settings: Settings,
-    features: NDArray[np.float64],
-    visibility: NDArray[np.float32],
-    clip: NDArray[np.int32],
-    threads: int,
-) -> tuple[Settings, PoseModel, Report, bool | None]:
-    """The model that was asked for; or the smallest within the tolerance, else the best, and whether it is within."""
-    if tolerance is None:
-        return settings, *fit_model(features, visibility, clip, settings, threads), None
-    best: tuple[float, Settings, PoseModel, Report] | None = None
-    for kind, lobes in SIZES:
-        tried = replace(settings, kind=kind, lobes=max(1, lobes))
-        model, report = fit_model(features, visibility, clip, tried, threads)
-        error = (report.held_out or report.training).bands
-        if error <= tolerance:
-            return tried, model, report, True
-        if best is None or error < best[0]:
-            best = (error, tried, model, report)
-    assert best is not None
-    return *best[1:], False
+def _chosen(
+    config: Config, tolerance: float | None, store: formats.Store, writer: formats.Writer, judge: PoseJudge
+) -> dict[str, Fit]:
+    """The smallest models whose pictures keep the tolerance, else those as good as any, by object's number; none where
+    there is no tolerance, or all were chosen before an interruption."""
+    poses: dict[str, Any] = store.attrs["poses"]
+    if tolerance is None or all(f"fit/{k}" in writer.done for k in poses):
+        return {}
+    places = poses_between(Draft(writer), TRIAL)
+    tried: list[dict[str, Fit]] = []
+    shares: list[float] = []
+    for size in SIZES:
+        fits = {k: fit_object(config, store, k, about, size) for k, about in poses.items()}
+        arrays = {f"pose/{k}/model/{name}": array for k, fit in fits.items() for name, array in fit.arrays.items()}
+        draft = Fitted(Draft(writer), arrays, {k: fit.about for k, fit in fits.items()})
+        tried.append(fits)
+        shares.append(judge.trial(draft, places, tolerance).share)
+        if shares[-1] <= CHOSEN * tolerance:
+            break
+    return tried[smallest(shares, tolerance)]
 
 
-def _put(writer: formats.Writer, group: str, model: PoseModel) -> None:
-    codes, scale = formats.quantise(model.slope, "int8", axis=2)
-    writer.put(f"{group}/intercept", model.intercept.astype(np.float32), dims=("vertex_side", "number"), codec="zstd")
-    writer.put(
-        f"{group}/slope",
-        codes,
-        dims=("vertex_side", "number", "component"),
-        attrs={"scale": f"{group}/slope_scale"},
-        codec="zstd",
-    )
-    writer.put(f"{group}/slope_scale", scale, dims=("vertex_side", "number", "one_component"), codec="zstd")
-    writer.put(f"{group}/centre", model.centre.astype(np.float32), dims=("vertex_side", "lobe", "axis"), codec="zstd")
-    writer.put(f"{group}/pose_mean", model.mean, dims=("feature",))
-    writer.put(f"{group}/pose_direction", model.directions, dims=("feature", "component"))
+def _report(told: dict[str, Any]) -> Report:
+    """The report that `asdict` has made a table of."""
+    held_out = told["held_out"] and Errors(**told["held_out"])
+    return Report(**{**told, "training": Errors(**told["training"]), "held_out": held_out})
+
+
+def _put(writer: formats.Writer, k: str, fit: Fit) -> None:
+    put_arrays(writer, f"pose/{k}/model", fit.arrays)
+    writer.record(f"fit/{k}", {**fit.cost, "model": fit.about, "report": asdict(fit.report)})
 
 
 def _size(store: formats.Store, k: str, about: dict[str, Any]) -> dict[str, Any]:
     frames, rows, coefficients = store.layouts[f"pose/{k}/visibility"].shape
-    sides = _sides(store, k, about)
+    sides = lit_sides(store, k, about)
     return {
         "object": about["object"],
         "frames": frames,
@@ -207,18 +170,6 @@ def _size(store: formats.Store, k: str, about: dict[str, Any]) -> dict[str, Any]
         "sides": sides,
         "coefficients": coefficients,
     }
-
-
-def _sides(store: formats.Store, k: str, about: dict[str, Any]) -> int:
-    """At how many sides an object's vertices were traced: 1, or 2 where its back is lit too."""
-    sides, rows = about.get("sides"), store.layouts[f"pose/{k}/visibility"].shape[1]
-    vertices = store.layouts[f"pose/{k}/rig/position"].shape[0]
-    if sides not in (1, 2) or rows != sides * vertices:
-        raise StoreError(
-            f"{store.path}: pose/{k}/visibility: expected rows for 1 or 2 sides (poses.{k}.sides) of {vertices} "
-            f"vertices, found {rows} rows and {sides!r} sides. Precompute it again."
-        )
-    return int(sides)
 
 
 def _summary(config: Config, started: float, resumed: bool) -> dict[str, Any]:
@@ -241,17 +192,13 @@ def _summary(config: Config, started: float, resumed: bool) -> dict[str, Any]:
                 "held_out": report["held_out"],
             }
         )
-        if block["within_tolerance"] is False:
-            error = (report["held_out"] or report["training"])["bands"]
-            notes.append(
-                f"{model['object']}: --tolerance {config.tolerance:g} is not reached; the best errs by {error:.3f}"
-            )
         if report["held_out"] is None:
             notes.append(f"{model['object']}: one run of frames only, so no error of unseen poses was measured")
     return {
         "store": str(config.output),
         "status": "resumed" if resumed else "written",
         "objects": objects,
+        **({"measured_error": store.attrs["measured_error"]["share"]} if "measured_error" in store.attrs else {}),
         "bytes": sum(size.stored for size in sizes.values()),
         "seconds": time.perf_counter() - started,
         "notes": notes,

@@ -20,7 +20,7 @@ from relightcli.stages.lay_out import make_job, put_scene
 from relightcli.stages.pose_job import simulate_poses
 from relightcli.stages.precompute_config import Config
 from relightcli.stages.prepare import Prepared, prepare
-from relightcli.stages.promise import keep_promise, keep_promise_moving
+from relightcli.stages.promise import keep_promise, keep_promise_moving, need_reach
 from relightcli.stages.promise_moving import choose_fields
 from relightcli.stages.visibility_job import block_size, create_outputs
 
@@ -36,7 +36,7 @@ def precompute(config: Config) -> dict[str, Any]:
     run.need_scheduler(None if config.dry_run else config.scheduler)
     prepared = prepare(config, account)
     if config.dry_run:
-        return dry_run(prepared, account)
+        return dry_run(prepared, account, _settings(prepared))
     inputs = scene_inputs(scene := prepared.scene)
     need_unchanged(prepared.read)
     source, geometry, moving = prepared.source, prepared.geometry, prepared.moving
@@ -51,6 +51,8 @@ def precompute(config: Config) -> dict[str, Any]:
     if writer is None:
         return {"store": str(config.output), "status": "up to date", "notes": list(geometry.notes)}
     with writer:
+        if prepared.promise is not None:
+            need_reach(prepared.config, prepared.promise, scene, prepared.tried, prepared.finer_helps)
         resumed = bool(writer.done)
         with account.step("receivers"):
             receivers, buried, starts = prepared.receivers()
@@ -101,10 +103,10 @@ def precompute(config: Config) -> dict[str, Any]:
                     config.quiet,
                     config.scheduler,
                 )
-        if prepared.promise is not None and moving is not None:
+        if prepared.checked and prepared.promise is not None and moving is not None:
             with account.step("check"):
                 keep_promise_moving(config, prepared.promise, scene, source, writer)
-        elif prepared.promise is not None:
+        elif prepared.checked and prepared.promise is not None:
             with account.step("check"):
                 keep_promise(
                     prepared.config,

@@ -69,6 +69,11 @@ class Prepared:
         return "shadows" in self.simulated
 
     @property
+    def checked(self) -> bool:
+        """Whether the error is measured here: of characters it is where they can be posed, by fit-pose."""
+        return self.promise is not None and "pose" not in self.simulated
+
+    @property
     def finer_helps(self) -> bool:
         """Whether a finer resolution of light could bring the error down, as far as was tried."""
         return not self.tried or self.resolution == self.tried[-1].resolution
@@ -159,10 +164,10 @@ def prepare(config: Config, account: Account) -> Prepared:
         check_bounces(config)
     plan += [pose, fields]
     simulated = [d.effect for d in plan if d.simulate]
-    if promise is not None and "pose" in simulated:
+    if promise is not None and {"pose", "fields"} <= set(simulated):
         raise InputError(
-            f"--tolerance: {scene.path} has characters, and no error is promised for the light on their poses; leave "
-            "it out, or name effects without pose"
+            f"--tolerance: {scene.path} has characters and objects that may be moved, and no error is promised for the "
+            "light between these; leave it out, or name effects without pose or without fields"
         )
     shadows = "shadows" in simulated
     bounce_cells = 0

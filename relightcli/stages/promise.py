@@ -16,13 +16,11 @@ from relightcli.adapters.rays import Tracer
 from relightcli.core.transport.receivers import receivers_of_vertices
 from relightcli.errors import NumericalError
 from relightcli.plan import pilot
-from relightcli.run.accounting import Meter
 from relightcli.scene.model import Camera, Geometry, Scene
 from relightcli.stages.lighting import LightingStore
 from relightcli.stages.measured_error import (
     GAIN,
     MORE,
-    STRIP,
     Draft,
     Judge,
     Strips,
@@ -30,7 +28,6 @@ from relightcli.stages.measured_error import (
     check_views,
     edit_of,
     pixel_strips,
-    rows_of,
     trial,
     vertex_strips,
 )
@@ -42,7 +39,8 @@ if TYPE_CHECKING:
     from relightcli.stages.precompute_config import Config
 
 RESOLUTIONS = (16, 32, 64, 128)  # to choose from
-GRIDS = (1, 2, MOST_PIXEL_GRID)  # of receivers along a pixel's side, to choose from
+GRIDS = (1, 2, 4, MOST_PIXEL_GRID)  # of receivers along a pixel's side, to choose from
+MOST_RECEIVERS = 5_000_000  # of a picture with a grid that is chosen: 4 x 4 in each of 640 x 480
 Receiving = Callable[[int], "tuple[Receivers | PixelReceivers, NDArray[np.bool_] | None]"]  # by grid of pixels
 DIRECT = 0.8  # of the tolerance: what direct light may be off by; the square of the rest is for what is left out
 
@@ -63,7 +61,8 @@ def _strips(
     return [vertex_strips(geometry, tracer, camera, front, back, hidden) for camera in cameras]
 
 
-def _camera_of(config: Config) -> str | None:
+def camera_of(config: Config) -> str | None:
+    """The camera whose pixels are to be the receivers; None for vertices."""
     return None if config.receivers == "vertices" else config.receivers.partition(":")[2]
 
 
@@ -83,11 +82,16 @@ def try_settings(
     config: Config, scene: Scene, source: Geometry, geometry: Geometry, receivers_of: Receiving, promise: float
 ) -> list[Tried]:
     """Errors of direct light by grid of pixels and resolution, up to what will do, in the pilot's views and skies.
-    What was asked for is all that is tried of it."""
+    What was asked for is all that is tried of it. A finer grid is tried from the coarsest resolution on that was as
+    good as any with the one before."""
     resolutions = [r for r in RESOLUTIONS if config.refine * 4 <= r]
     if config.light_resolution is not None:
         resolutions = [config.light_resolution]
-    grids = GRIDS if config.pixel_grid is None and _camera_of(config) else (config.grid,)
+    only = camera_of(config)
+    grids: tuple[int, ...] = (config.grid,)
+    if config.pixel_grid is None and only:
+        width, height = scene.cameras[only].size
+        grids = tuple(grid for grid in GRIDS if grid == 1 or grid**2 * width * height <= MOST_RECEIVERS)
     judge = Judge(scene, source, Tracer(source.positions, source.faces))
     out: list[Tried] = []
     for grid in grids:
@@ -99,6 +103,9 @@ def try_settings(
         out += [Tried(resolution, grid, error, lit, passes) for resolution, error in found]
         if out[-1].error.share <= DIRECT * promise:
             break
+        least = min(error.share for _, error in found)
+        first = next(resolution for resolution, error in found if error.share <= (1.0 + GAIN) * least)
+        resolutions = [r for r in resolutions if r >= first]
     return out
 
 
@@ -111,7 +118,7 @@ def _try_resolutions(
     resolutions: Sequence[int],
     most: float,
 ) -> list[tuple[int, pilot.Share]]:
-    only, scene, source = _camera_of(config), judge.scene, judge.geometry
+    only, scene, source = camera_of(config), judge.scene, judge.geometry
     cameras = [scene.cameras[only]] if only else list(scene.cameras.values())[: pilot.MOST_VIEWS]
     if not cameras:
         cameras = check_views(scene, source, None)
@@ -138,25 +145,34 @@ def choose(tried: list[Tried], promise: float) -> Tried:
     return next(one for one in tried if one.error.share <= most)
 
 
-def predict_check(
-    config: Config, scene: Scene, source: Geometry, bounces: int, tried: Sequence[Tried]
-) -> dict[str, float]:
-    """seconds and cpu_seconds that `keep_promise` will take: to trace, from a few rows of one of its pictures, as
-    often as it took for what was tried; for light, from the direct light of that."""
-    judge = Judge(scene, source, Tracer(source.positions, source.faces))
-    cameras, skies = check_views(scene, source, _camera_of(config)), check_skies()
-    middle = cameras[0].size[1] // 2
-    rows = (max(0, middle - STRIP // 2), middle + max(1, STRIP // 2))
-    meter = Meter()
-    judge.trace(Strips(cameras[0], [rows], []), next(iter(skies.values())), scene.materials, bounces + MORE, 0)
-    taken = meter.read()
-    pixels = sum(sum(b - a for a, b in rows_of(c)) * c.size[0] for c in cameras)
-    times = 2 * len(skies) * pixels / ((rows[1] - rows[0]) * cameras[0].size[0])
-    pictures = len(skies) * len(cameras)
-    light = tried[-1].lit if tried else {"seconds": 0.0, "cpu_seconds": 0.0}
-    if tried:
-        times *= tried[-1].passes
-    return {key: times * taken[key] + pictures * light[key] for key in ("seconds", "cpu_seconds")}
+def need_reach(config: Config, promise: float, scene: Scene, tried: Sequence[Tried], finer_helps: bool) -> None:
+    """Raises NumericalError where direct light alone misses the tolerance beyond doubt, with all that was tried."""
+    missed = out_of_reach(promise, tried)
+    if missed is not None and not config.allow_miss:
+        knob = _sharper(config, scene, tried[-1].resolution, finer_helps)
+        raise NumericalError(
+            f"{config.output}: {missed}. What would help: {knob}. Nothing was simulated; the same command with "
+            "--allow-miss does it as it is"
+        )
+
+
+def out_of_reach(promise: float, tried: Sequence[Tried]) -> str | None:
+    """What there is to say of direct light that misses the tolerance, by a lower bound; None where it may keep it."""
+    best = min((one.error for one in tried), key=lambda error: error.least, default=None)
+    if best is None or best.least <= promise:
+        return None
+    return f"direct light alone errs by {best.share:.2%} ({best.where}), more than the tolerance of {promise:.2%}"
+
+
+def _sharper(config: Config, scene: Scene, resolution: int, finer_helps: bool) -> str:
+    """The option that brings the error of direct light down."""
+    if config.receivers == "vertices":
+        return f"--receivers pixels:{next(iter(scene.cameras), 'CAMERA')}, or a finer mesh"
+    if resolution < RESOLUTIONS[-1] and finer_helps:
+        return f"--light-resolution {2 * resolution}"
+    grid = config.grid + 1
+    finer = f"--pixel-grid {grid}" if grid <= MOST_PIXEL_GRID else "a larger picture"
+    return finer + (f" or --light-resolution {2 * resolution}" if finer_helps else "")
 
 
 def keep_promise_moving(config: Config, promise: float, scene: Scene, source: Geometry, writer: formats.Writer) -> None:
@@ -199,7 +215,7 @@ def keep_promise(
     """
     lighting = LightingStore(cast("formats.Store", Draft(writer)), config.workers)
     judge = Judge(scene, source, Tracer(source.positions, source.faces))
-    strips = _strips(scene, geometry, receivers, buried, check_views(scene, source, _camera_of(config)))
+    strips = _strips(scene, geometry, receivers, buried, check_views(scene, source, camera_of(config)))
     skies = check_skies()
     bounces = lighting.bounces
     edit = edit_of(scene.materials, set(scene.materials))
@@ -209,15 +225,9 @@ def keep_promise(
         return
     direct = judge.error(lighting, strips, skies, 0, 0, None, DIRECT * promise)
     if direct.share <= DIRECT * promise:
-        knob = f"--bounces {bounces + 1} or a finer --bounce-resolution"
-    elif config.receivers == "vertices":
-        knob = f"--receivers pixels:{next(iter(scene.cameras), 'CAMERA')}, or a finer mesh"
-    elif resolution < RESOLUTIONS[-1] and finer_helps:
-        knob = f"--light-resolution {2 * resolution}"
+        knob = f"--bounces {bounces + 1}, a finer --bounce-resolution, or a finer mesh to bounce light off"
     else:
-        grid = config.grid + 1
-        finer = f"--pixel-grid {grid}" if grid <= MOST_PIXEL_GRID else "a larger picture"
-        knob = finer + (f" or --light-resolution {2 * resolution}" if finer_helps else "")
+        knob = _sharper(config, scene, resolution, finer_helps)
     raise NumericalError(
         f"{config.output}: the error is {found.share:.2%} ({found.where}; of direct light {direct.share:.2%}), more "
         f"than the tolerance of {promise:.2%}. What would help: {knob}. The work is kept in "

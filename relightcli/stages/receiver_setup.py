@@ -25,7 +25,7 @@ from relightcli.errors import InputError
 from relightcli.scene.model import Geometry, Scene
 
 PIXEL_EDGE_GRID = 3  # the least samples along a pixel's side at the edges of a picture, for pixel receivers
-MOST_PIXEL_GRID = 4
+MOST_PIXEL_GRID = 8
 
 
 @dataclass(frozen=True)

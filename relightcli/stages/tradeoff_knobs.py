@@ -203,7 +203,7 @@ _TABLE = (
         lambda v: ("--subdivide" if v == "yes" else "--no-subdivide",),
     ),
     Knob("receivers", "precompute", _receivers, "vertices or pixels:CAMERA", _option("--receivers")),
-    Knob("pixel-grid", "precompute", _whole(1, 4), "1 to 4", _option("--pixel-grid"), (_PIXELS,)),
+    Knob("pixel-grid", "precompute", _whole(1, 8), "1 to 8", _option("--pixel-grid"), (_PIXELS,)),
     Knob("bounces", "precompute", _whole(0, 64), "0 to 64", _option("--bounces")),
     Knob(
         "bounce-resolution", "precompute", _whole(8, 32, 8), "8, 16 or 32", _option("--bounce-resolution"), (_BOUNCED,)

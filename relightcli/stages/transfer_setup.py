@@ -166,8 +166,9 @@ class TransferSetup:
             whole.cells, start, whole.source[index], whole.cell[index], whole.cosine[index], whole.solid_angle[index]
         )
 
-    def second_sources(self, lights: Sources, order: int) -> Sources:
-        """What receivers gather of light that was reflected once: for each light of `lights` and channel, (l, q)."""
+    def second_sources(self, lights: Sources, order: int, only: NDArray[np.int64] | None = None) -> Sources:
+        """What receivers gather of light that was reflected once: for each light of `lights` and channel, (l, q).
+        only: those that it is computed for, rising, the others get 0; None for all."""
         lighting = self.lighting
         even_weights = even_projection(order).astype(np.float32)
         used = used_terms(order - 1)
@@ -176,8 +177,9 @@ class TransferSetup:
         n, q, count = len(lighting), self.count, lights.even.shape[1]
         even = np.empty((n, count * q), np.float32)
         factor = np.zeros((int((self.model >= 0).sum()), len(used), count * q), np.float32)
-        for start in range(0, n, BLOCK):
-            rows = np.arange(start, min(start + BLOCK, n))
+        wanted = np.arange(n) if only is None else only
+        for start in range(0, len(wanted), BLOCK):
+            rows = wanted[start : start + BLOCK]
             world = self.gather_rows(rows, lights, order)
             flat = np.moveaxis(world, 1, 3).reshape(len(rows), order * order, count * q)
             local = local_rotations(lighting.normal[rows], order) @ flat

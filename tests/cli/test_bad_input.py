@@ -98,7 +98,7 @@ def test_meshes(here, refused, content, words):
         (("--effects", "shadows"), ("--effects", "'direct' must be among them")),
         (("--receivers", "pixels"), ("--receivers", "pixels:CAMERA", "found 'pixels'")),
         (("--pixel-grid", "2"), ("--pixel-grid", "--receivers pixels:CAMERA")),
-        (("--pixel-grid", "5"), ("--pixel-grid", "1 to 4", "found 5")),
+        (("--pixel-grid", "9"), ("--pixel-grid", "1 to 8", "found 9")),
         (("--receivers", "pixels:side"), ("--receivers", "no camera 'side'", "main")),
         (("--basis", "wavelet"), ("--basis", "visibility, haar, sh, dense", "found 'wavelet'")),
         (("--basis", "haar", "--coefficients", "0"), ("--coefficients", "found 0")),

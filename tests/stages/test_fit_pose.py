@@ -204,13 +204,6 @@ def test_kinds_and_weights(transfer):
         assert np.linalg.norm(picture - pictures["sh"]) < (0.2 if name == "one" else 0.1) * norm
 
 
-def test_tolerance_picks_the_smallest_model(transfer):
-    free = fit_pose(Config(store=transfer, output=transfer.parent / "t1.zarr", tolerance=0.9, quiet=True))
-    assert free["objects"][0]["lobes"] == 1
-    tight = fit_pose(Config(store=transfer, output=transfer.parent / "t2.zarr", tolerance=1e-5, quiet=True))
-    assert any("--tolerance" in note for note in tight["notes"])
-
-
 def test_a_pose_far_from_training_is_flagged(transfer, tmp_path):
     scene = make_scene(tmp_path)
     store = fit(make_store(scene, **{**SMALL, "pose_frames": "spread:1"}))

@@ -88,11 +88,19 @@ def test_a_miss_is_told_and_may_be_allowed(tmp_path):
     parts = {"ground": square(3, material=lambert(0.5)), "ball": sphere(0.4, (0, 0.5, 0), rings=24)}
     bad = write_scene(tmp_path, parts, [CAMERA], {})
     store = tmp_path / "t.zarr"
-    with pytest.raises(NumericalError, match=r"more than the tolerance of 2\.00%.*--receivers pixels:main.*allow-miss"):
+    said = r"more than the tolerance of 2\.00%.*--receivers pixels:main.*{}.*allow-miss"
+    # Direct light alone tells, so that nothing is simulated; with all settings given it is found out at the end.
+    with pytest.raises(NumericalError, match=said.format("Nothing was simulated")):
         run(bad, store, tolerance=0.02)
+    assert any("direct light alone errs" in note for note in run(bad, store, tolerance=0.02, dry_run=True)["notes"])
+    late = tmp_path / "late.zarr"
+    with pytest.raises(NumericalError, match=said.format("work is kept")):
+        run(bad, late, tolerance=0.02, light_resolution=16, bounces=0)
+    assert not late.exists()
+    assert run(bad, late, tolerance=0.02, light_resolution=16, bounces=0, allow_miss=True)["status"] == "resumed"
     assert not store.exists()
     done = run(bad, store, tolerance=0.02, allow_miss=True)
-    assert done["status"] == "resumed"
+    assert done["status"] == "written"
     measured = formats.open_store(store).attrs["measured_error"]
     assert measured["share"] > 0.1
     assert run(bad, store, tolerance=0.02)["status"] == "up to date"

@@ -19,6 +19,7 @@ sharpness; lobes at least LEAST_WIDTH wide keep their energy to a percent up to 
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -49,16 +50,25 @@ def polar_cosines() -> NDArray[np.float64]:
 
 
 def separate(model: int, row: NDArray[np.float64]) -> Separable:
-    """The specular lobe of a parameter row (`brdf.models`), without its colour."""
-    spectra, lit, seen = harmonics(model, row[None])
+    """The specular lobe of a parameter row (`brdf.models`), without its colour. Arrays are not to be written to: those
+    of the last few lobes are kept, as every picture asks for them again."""
+    return _separate(model, row.tobytes())
+
+
+@lru_cache(maxsize=256)
+def _separate(model: int, parameters: bytes) -> Separable:
+    spectra, lit, seen = harmonics(model, np.frombuffer(parameters)[None])
     u, size, vt = np.linalg.svd(spectra[0] * (seen[:, None] * lit))
     root = np.sqrt(size)
     view = [root[:count, j, None] * u[:count, :, j] / seen for j, count in enumerate(ROWS)]
     light = [root[:count, j, None] * vt[:count, j] / lit for j, count in enumerate(ROWS)]
-    return Separable(
+    made = Separable(
         np.ascontiguousarray(np.concatenate(view).T, np.float32),
         np.ascontiguousarray(np.concatenate(light).T, np.float32),
     )
+    for factor in made:
+        factor.flags.writeable = False
+    return made
 
 
 def harmonics(

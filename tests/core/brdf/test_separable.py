@@ -106,3 +106,14 @@ def test_extreme_lobes_stay_finite(roughness, f0):
         assert factor.shape == (POLAR, TERMS)
         assert np.isfinite(factor).all()
         assert factor.any()
+
+
+def test_the_same_lobe_is_not_separated_twice():
+    # A picture asks for the factors of every lobe, and a sequence for the same ones in every frame.
+    model, row = row_of(model="cook-torrance", roughness=0.31, f0=0.8)
+    found = separate(model, row)
+    assert separate(model, row.copy()) is found
+    with pytest.raises(ValueError, match="read-only"):
+        found.view_factor[0, 0] = 1.0
+    row[:] = row_of(model="cook-torrance", roughness=0.32, f0=0.8)[1]
+    assert separate(model, row) is not found

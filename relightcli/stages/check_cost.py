@@ -1,0 +1,101 @@
+"""What the check at the end of `precompute --tolerance` will take, predicted by a dry run.
+
+Path tracing is predicted from a few rows of one of the check's pictures. Light is computed in a store of which no more
+than some receivers were traced, before and after that: what it takes without any is there for every store, the rest
+goes with the receivers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+import relight_formats as formats
+from relightcli.adapters.rays import Tracer
+from relightcli.run.accounting import Meter
+from relightcli.scene.model import Geometry, Scene
+from relightcli.stages.lighting import LightingStore
+from relightcli.stages.measured_error import MORE, STRIP, Draft, Judge, Sky, Strips, check_skies, check_views, rows_of
+from relightcli.stages.precompute_config import Config
+from relightcli.stages.promise import Tried, camera_of
+
+Costs = dict[str, float]
+KEYS = ("seconds", "cpu_seconds")
+
+
+@dataclass(frozen=True)
+class LightCosts:
+    """seconds and cpu_seconds of the light of a picture: reflected once; after that, and what the first picture takes
+    more of it."""
+
+    direct: Costs
+    bounced: Costs
+    once: Costs
+
+    def grown(self, none: LightCosts, times: float) -> LightCosts:
+        """Of so many times the receivers, where `none` is what it takes without any."""
+        return LightCosts(
+            *(
+                {key: fixed[key] + times * max(0.0, found[key] - fixed[key]) for key in KEYS}
+                for found, fixed in zip(
+                    (self.direct, self.bounced, self.once), (none.direct, none.bounced, none.once), strict=True
+                )
+            )
+        )
+
+
+def measure_light(writer: formats.Writer, config: Config, scene: Scene, source: Geometry, bounces: int) -> LightCosts:
+    """Times the light of a picture with what the store has by now."""
+    sky = next(reversed(check_skies().values()))
+    eye = np.array(check_views(scene, source, camera_of(config))[0].eye)
+    _light(_open(writer, config), scene, sky, eye, bounces)  # kernels are loaded
+    lighting = _open(writer, config)
+    first, direct, whole = (_light(lighting, scene, sky, eye, number) for number in (bounces, 0, bounces))
+    return LightCosts(
+        direct,
+        {key: max(0.0, whole[key] - direct[key]) for key in KEYS},
+        {key: max(0.0, first[key] - whole[key]) for key in KEYS},
+    )
+
+
+def _open(writer: formats.Writer, config: Config) -> LightingStore:
+    return LightingStore(cast("formats.Store", Draft(writer)), config.workers)
+
+
+def _light(lighting: LightingStore, scene: Scene, sky: Sky, eye: np.ndarray, bounces: int) -> Costs:
+    d = eye - lighting.position
+    view = (d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-300)).astype(np.float32)
+    meter = Meter()
+    lighting.exit_radiance(sky, 0.0, scene.materials, view, None, None, bounces)
+    return meter.read()
+
+
+def predict_check(
+    only: str | None, scene: Scene, source: Geometry, bounces: int, tried: Sequence[Tried], light: LightCosts | None
+) -> Costs:
+    """seconds and cpu_seconds that the check will take: to trace, as often as it took for what was tried; for light
+    reflected once, what that took there, if anything was tried; for the rest as `light` has it. only: the camera of a
+    store of pixels."""
+    judge = Judge(scene, source, Tracer(source.positions, source.faces))
+    cameras, skies = check_views(scene, source, only), check_skies()
+    middle = cameras[0].size[1] // 2
+    rows = (max(0, middle - STRIP // 2), middle + max(1, STRIP // 2))
+    meter = Meter()
+    judge.trace(Strips(cameras[0], [rows], []), next(iter(skies.values())), scene.materials, bounces + MORE, 0)
+    taken = meter.read()
+    pixels = sum(sum(b - a for a, b in rows_of(c)) * c.size[0] for c in cameras)
+    times = 2 * len(skies) * pixels / ((rows[1] - rows[0]) * cameras[0].size[0])
+    if tried:
+        times *= tried[-1].passes
+    pictures = len(skies) * len(cameras)
+    out = {key: times * taken[key] for key in KEYS}
+    for key in KEYS:
+        if tried:
+            out[key] += pictures * tried[-1].lit[key]
+        if light is not None:
+            direct = 0.0 if tried else light.direct[key]
+            out[key] += pictures * (direct + light.bounced[key]) + light.once[key]
+    return out

@@ -1,0 +1,77 @@
+"""Costs that dry runs of cluster, factorize and fit-pose predict, beside those of the stages themselves."""
+
+from __future__ import annotations
+
+import pytest
+
+import relight_formats as formats
+from relightcli.stages import cluster, factorize, fit_pose
+from relightcli.stages.part_cost import Costs, grown
+from tests.core.transport.scenes import lambert, sphere
+from tests.stages.pose_files import SCENE, pose_scene
+from tests.stages.scene_files import make_store, write_scene
+from tests.stages.test_asset import CAMERA, ground
+from tests.stages.test_bounces import GOLD
+
+BYTES = 1.2  # set out to be reached
+SECONDS = (0.1, 10.0)  # a sanity check: seconds on machines that others use are rough
+
+
+@pytest.fixture(scope="module")
+def transfer(tmp_path_factory):
+    parts = {
+        "ground": ground(24, lambert((0.6, 0.5, 0.4))),
+        "gold": sphere(0.35, (0.45, 0.36, 0.1), rings=16, material=GOLD),
+    }
+    scene = write_scene(tmp_path_factory.mktemp("scene"), parts, [CAMERA], {}, adjustable=True)
+    return make_store(scene, workers=1, bounces=2, light_resolution=32, bounce_resolution=8, subdivide=False)
+
+
+def check(stage, module, store, output, **settings):
+    """Runs a stage dry and then in earnest; whether it left nothing before, and took what it said."""
+    config = {"store": store, "output": output, "quiet": True, **settings}
+    told = stage(module.Config(**config, dry_run=True))
+    assert not output.exists()
+    assert not output.with_name(output.name + ".partial").exists()
+    done = stage(module.Config(**config))
+    predicted = told["predicted"]
+    assert done["bytes"] / BYTES <= predicted["bytes"] <= done["bytes"] * BYTES
+    assert SECONDS[0] * done["seconds"] <= predicted["seconds"] <= SECONDS[1] * done["seconds"]
+    assert predicted["cpu_seconds"] > 0.0
+    return output
+
+
+def test_cluster_and_factorize(transfer):
+    clusters = check(cluster.cluster, cluster, transfer, transfer.parent / "clusters.zarr", clusters=6)
+    check(factorize.factorize, factorize, clusters, transfer.parent / "asset.zarr", light_rank=32)
+
+
+@pytest.mark.parametrize("tolerance", [None, 0.5])
+def test_fit_pose(tmp_path, tolerance):
+    scene = pose_scene(tmp_path, SCENE.replace("size = [20, 16]", "size = [12, 9]"))
+    store = make_store(scene, light_resolution=16, pose_directions=64, bounces=0, subdivide=False)
+    check(fit_pose.fit_pose, fit_pose, store, tmp_path / "pose.zarr", tolerance=tolerance)
+
+
+def test_what_grows_is_told_from_what_does_not():
+    asked = []
+
+    def part(count):
+        asked.append(count)
+        loading = 5.0 if len(asked) == 1 else 0.0
+        return Costs(loading + 1.0 + 0.1 * count, 2.0 * count, 100.0 + 3.0 * count)
+
+    found = grown(part, (10, 30), 1000)
+    assert asked == [10, 10, 30]
+    assert found.seconds == pytest.approx(5.0 + 1.0 + 0.1 * 1000)
+    assert found.cpu_seconds == pytest.approx(2.0 * 1000)
+    assert found.bytes == pytest.approx(100.0 + 3.0 * 1000)
+    assert grown(part, (10, 10), 10).bytes == 130.0
+
+
+def test_a_finished_store_is_predicted_as_well(transfer):
+    config = cluster.Config(transfer, transfer.parent / "twice.zarr", clusters=3, quiet=True)
+    cluster.cluster(config)
+    before = formats.open_store(config.output).fingerprint
+    assert cluster.cluster(cluster.Config(transfer, config.output, clusters=3, dry_run=True, quiet=True))["predicted"]
+    assert formats.open_store(config.output).fingerprint == before
