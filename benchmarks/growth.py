@@ -8,7 +8,6 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from resource import RUSAGE_CHILDREN, getrusage
 
 import numpy as np
 
@@ -103,14 +102,14 @@ def _pictures(setting: Setting, frames: int) -> Point:
 
 
 def _run(made: Path, *arguments: str | Path) -> Point:
-    before = _cpu()
     finished, said = run_tool(*arguments)
-    return said.get("receivers", 0), finished.seconds, _cpu() - before, finished.peak_bytes / 1e9, _size(made) / 1e6
-
-
-def _cpu() -> float:
-    usage = getrusage(RUSAGE_CHILDREN)
-    return usage.ru_utime + usage.ru_stime
+    return (
+        said.get("receivers", 0),
+        finished.seconds,
+        finished.cpu_seconds,
+        finished.peak_bytes / 1e9,
+        _size(made) / 1e6,
+    )
 
 
 def _size(store: Path) -> int:

@@ -21,13 +21,13 @@ PATIENCE = 900.0  # seconds that a process waits for the others before it gives 
 
 @dataclass(frozen=True)
 class Finished:
-    """seconds from start to end; peak_bytes of the largest process among the program and its workers; its stdout;
-    cpu_seconds of processor time, of all of them."""
+    """seconds from start to end; cpu_seconds of the program and its workers; peak_bytes of the largest process among
+    them; its stdout."""
 
     seconds: float
+    cpu_seconds: float
     peak_bytes: int
     stdout: bytes
-    cpu_seconds: float
 
 
 def cores() -> int:
@@ -53,7 +53,7 @@ def run_program(*command: str | Path, stdin: bytes | None = None, env: dict[str,
         err.seek(0)
         if process.returncode != 0:
             raise RuntimeError(f"{command[0]} ended with {process.returncode}: {err.read().decode()[-2000:]}")
-        return Finished(seconds, usage.ru_maxrss * 1024, out.read(), usage.ru_utime + usage.ru_stime)
+        return Finished(seconds, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024, out.read())
 
 
 def run_tool(*arguments: str | Path, env: dict[str, str] | None = None) -> tuple[Finished, dict[str, Any]]:

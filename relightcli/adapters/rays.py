@@ -1,8 +1,9 @@
 """Embree behind three calls. Rays live in a normalised frame, so that the scale and place of a scene do not matter.
 
 The frame recentres the scene on its bounding box and scales it by a power of two into [-1, 1]: the float32 mantissas
-that Embree sees are then the same for a scene in millimetres and in kilometres. Embree holds the interpreter lock:
-parallelism is processes, each with a `Tracer` of its own.
+that Embree sees are then the same for a scene in millimetres and in kilometres. Parallelism is processes, each with a
+`Tracer` of its own. Rays go to Embree in packets (`relightcli.adapters.embree`), or one by one where its library cannot
+be called but through embreex.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from relightcli.adapters.embree import PacketScene, library
 
 # Distance of a ray's origin from its surface, in the normalised frame. Coordinates there are below 1, spaced by at
 # most 2^-24; Embree's robust intersection is exact to a few such spacings.
@@ -38,9 +41,6 @@ class Tracer:
     """
 
     def __init__(self, positions: NDArray[np.float64], faces: NDArray[np.int32]) -> None:
-        from embreex import rtcore_scene
-        from embreex.mesh_construction import TriangleMesh
-
         used = np.zeros(len(positions), bool)
         used[faces] = True
         corners = positions[used] if len(faces) else np.zeros((1, 3))
@@ -48,11 +48,11 @@ class Tracer:
         self.center: NDArray[np.float64] = 0.5 * (low + high)
         half = float(np.max(high - low)) * 0.5
         self.scale: float = 2.0 ** -math.ceil(math.log2(half)) if half > 0 else 1.0
-        self._scene: Any = rtcore_scene.EmbreeScene(robust=True)
-        self._keep: Any = None
-        if len(faces):
-            self._keep = TriangleMesh(self._scene, self.to_local(positions), np.ascontiguousarray(faces, np.int32))
         self.empty = len(faces) == 0
+        self._scene: PacketScene | SingleScene | None = None
+        if not self.empty:
+            vertices, triangles, loaded = self.to_local(positions), np.ascontiguousarray(faces, np.int32), library()
+            self._scene = PacketScene(loaded, vertices, triangles) if loaded else SingleScene(vertices, triangles)
 
     def to_local(self, points: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
         """World points (..., 3) in the normalised frame, float32."""
@@ -70,17 +70,41 @@ class Tracer:
         max_distance: NDArray[np.float32] | None = None,
     ) -> NDArray[np.bool_]:
         """True (N,) where anything lies along the ray, up to `max_distance` (N,) in units of the direction."""
-        if self.empty or len(origins) == 0:
+        if self._scene is None or len(origins) == 0:
             return np.zeros(len(origins), bool)
-        found: NDArray[np.int32] = self._scene.run(origins, directions, dists=max_distance, query="OCCLUDED")
-        blocked: NDArray[np.bool_] = found == 0
-        return blocked
+        return self._scene.occluded(origins, directions, max_distance)
 
     def intersect(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> Hits:
         """Nearest hit of every ray. origins, directions (N, 3) float32 in the normalised frame."""
         n = len(origins)
-        if self.empty or n == 0:
+        if self._scene is None or n == 0:
             zero = np.zeros(n, np.float32)
             return Hits(np.full(n, -1, np.int32), zero, zero, np.full(n, np.inf, np.float32))
+        return Hits(*self._scene.intersect(origins, directions))
+
+
+class SingleScene:
+    """A committed scene of triangles through embreex, which traces ray by ray; else as `PacketScene`."""
+
+    def __init__(self, vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> None:
+        from embreex import rtcore_scene
+        from embreex.mesh_construction import TriangleMesh
+
+        self._scene: Any = rtcore_scene.EmbreeScene(robust=True)
+        self._keep: Any = TriangleMesh(self._scene, vertices, faces)
+
+    def occluded(
+        self,
+        origins: NDArray[np.float32],
+        directions: NDArray[np.float32],
+        max_distance: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.bool_]:
+        found: NDArray[np.int32] = self._scene.run(origins, directions, dists=max_distance, query="OCCLUDED")
+        blocked: NDArray[np.bool_] = found == 0
+        return blocked
+
+    def intersect(
+        self, origins: NDArray[np.float32], directions: NDArray[np.float32]
+    ) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         found = self._scene.run(origins, directions, query="INTERSECT", output=True)
-        return Hits(found["primID"], found["u"], found["v"], found["tfar"])
+        return found["primID"], found["u"], found["v"], found["tfar"]

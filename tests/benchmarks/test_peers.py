@@ -1,6 +1,7 @@
 """The peers that are written here, and what they are given: they must not lose because they are wrong."""
 
 import numpy as np
+import pytest
 
 from benchmarks import mitsuba, sky_matrix
 from benchmarks.receivers import Traceable, sample, share
@@ -58,9 +59,13 @@ def test_patches():
 def test_a_sensor_under_an_open_sky(monkeypatch):
     monkeypatch.setattr("benchmarks.sky_matrix.meet", lambda: None)
     below = Traceable(WALL.mesh - [0, 2e4, 0], WALL.faces, WALL.position, WALL.normal)
-    _, _, parts = sky_matrix.our_matrix(0, 1, below, 32, 1)
+    found = sky_matrix.collect([sky_matrix.our_matrix(0, 1, below, 32, 1, np.array([1]))], 2)
+    assert found.rays == 2 * 3072
     # E = integral of (1 + 2 sin a) / 3 cos over the dome = 7 pi / 9; rows of 3 degrees and texels of 3 degrees: 1e-3.
-    np.testing.assert_allclose(np.concatenate([e for _, e in parts]), 7 * np.pi / 9, rtol=1e-3)
+    np.testing.assert_allclose(found.irradiance, 7 * np.pi / 9, rtol=1e-3)
+    # The rows of the matrix are those asked for, and a row under the sky is its irradiance.
+    assert found.entries.shape == (1, sky_matrix.PATCHES)
+    assert found.entries[0].astype(float) @ sky_matrix.overcast() == pytest.approx(found.irradiance[1], rel=1e-6)
 
 
 def test_map_for_bilinear_look_up():

@@ -29,7 +29,7 @@ def test_quick_run(tmp_path):
         assert row["measured"] > 0 or row["work"].startswith("bits wrong")
         assert (row["met"] is None) == (row["target"] == "")
     ratio = next(row["ratio"] for row in rows if row["work"].startswith("visibility rays"))
-    # Ours does the same traces and more: it cannot be twice as fast, nor, on a busy machine, ten times slower.
-    assert 0.1 < ratio < 2
+    # Eight rays at once are at most eight times as fast as one by one; nor, on a busy machine, ten times slower.
+    assert 0.1 < ratio < 8
     assert done.stdout.count("== ") == 2
     assert list(tmp_path.iterdir()) == [output]  # what was worked with is gone
