@@ -17,7 +17,10 @@ from typing import Any
 from benchmarks import compare, report
 
 # Ceilings, peers and whole stages: the short ones.
-SHORT = ("visibility", "picture", "mitsuba", "sh_transfer", "sky_matrix", "store", "scheduler", "asset")
+SHORT = (
+    *("visibility", "picture", "mitsuba", "sh_transfer", "sky_matrix", "tensors", "wavelets", "store", "scheduler"),
+    "asset",
+)
 LONG = (
     "growth",
     "accuracy",
@@ -34,7 +37,7 @@ LONG = (
     "moving",
 )
 NAMES = (*SHORT, *LONG)
-PACKAGES = ("relightcli", "numpy", "numba", "zarr", "embreex", "mitsuba", "pyradiance")
+PACKAGES = ("relightcli", "numpy", "numba", "zarr", "embreex", "mitsuba", "pyradiance", "tensorly", "PyWavelets")
 RESULTS = Path("build/bench.json")
 LAST = Path("build/bench/last.json")
 DOCUMENT = Path(__file__).parents[1] / "docs" / "performance.md"

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 LOSS = 0.20  # of a ratio, from which on a run fails
-TIMES = ("s", "ms", "frames/s", "Hz", "sensors/s", "Mray/s", "MB/s", "pictures")
+TIMES = ("s", "ms", "frames/s", "Hz", "sensors/s", "receivers/s", "Mray/s", "MB/s", "pictures")
 _NUMBER = re.compile(r"\d[\d,]*(\.\d+)?(e[+-]?\d+)?", re.IGNORECASE)
 
 

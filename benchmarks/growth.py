@@ -32,6 +32,19 @@ env_rotate = 0
 frame = {frames}
 env_rotate = 350
 """
+BALLS = 8
+PLASTIC = """\
+model = "cook-torrance"
+diffuse = [0.3, 0.2, 0.15]
+specular = [0.3, 0.3, 0.3]
+f0 = 0.5
+roughness = 0.4
+adjustable = true
+"""
+FIELDS = (
+    *("--no-subdivide", "--light-resolution", "16", "--bounces", "0"),
+    *("--field-shells", "6", "--field-resolution", "8"),
+)
 Point = tuple[float, ...]
 
 
@@ -64,6 +77,12 @@ def measure(setting: Setting) -> Report:
     cells = (8, 16)
     points = [_simulate(setting, few, (*BOUNCED, str(c))) for c in cells]
     _add(report, "precompute with one interreflection over cells along a face of what is seen", "cells", cells, points)
+    numbers = (1, 2) if setting.quick else (1, 2, 4, BALLS)
+    clusters, assets = zip(*(_tensors(setting, number) for number in numbers), strict=True)
+    _add(report, f"cluster over adjustable materials of {BALLS} balls", "materials", numbers, list(clusters))
+    _add(report, f"factorize over adjustable materials of {BALLS} balls", "materials", numbers, list(assets))
+    movers = [_fields(setting, number) for number in numbers]
+    _add(report, f"precompute over how many of {BALLS} balls can be moved", "movers", numbers, movers)
     for what, found in (("precompute", over_vertices), ("cluster of lights", lights)):
         report.rows.append(
             at_most(f"{what}: peak of a process at {sizes[-1]:,} vertices", found[-1][3], "GB", MOST_PEAK)
@@ -99,6 +118,51 @@ def _pictures(setting: Setting, frames: int) -> Point:
     sky = next(iter(two_skies(setting).values()))
     where = ("--env", sky, "--camera", "main", "--frames", shots, "-o", folder / "frame.####.exr")
     return _run(folder, "relight", setting.work / "growth.zarr", *where)
+
+
+def _balls(setting: Setting, materials: int, movers: int) -> Path:
+    """Eight balls in a ring on a ground, with so many adjustable materials among them; the first few can be moved."""
+    import trimesh
+
+    from relightcli.scene.shapes import rounded
+
+    source, _ = write_scene(setting, 500)
+    folder = setting.work / f"balls-{materials}-{movers}"
+    shutil.copytree(source.parent, folder, dirs_exist_ok=True)
+    text = (folder / "scene.toml").read_text()
+    text = text[: text.index("[objects.subject]")] + text[text.index("[objects.ground]") :]
+    for k in range(BALLS):
+        angle = 2.0 * np.pi * k / BALLS
+        place = [float(np.cos(angle)), 0.3, float(np.sin(angle))]
+        # No two alike: objects of one mesh share their field.
+        ball = rounded((0.5, 0.4 + 0.02 * k, 0.5), power=2, subdivisions=2 if setting.quick else 3)
+        trimesh.Trimesh(*ball, process=False).export(folder / f"ball{k}.ply")
+        motion = 'motion = "rigid"\n' if k < movers else ""
+        text += (
+            f'\n[objects.ball{k}]\nmesh = "ball{k}.ply"\nmaterial = "m{k % materials}"\n{motion}translate = {place}\n'
+        )
+    for k in range(materials):
+        text += f"\n[materials.m{k}]\n{PLASTIC}"
+    scene = folder / "scene.toml"
+    scene.write_text(text)
+    return scene
+
+
+def _tensors(setting: Setting, materials: int) -> tuple[Point, Point]:
+    """`cluster` and `factorize` of one interreflection."""
+    scene = _balls(setting, materials, 0)
+    names = ("growth", "growth-clusters", "growth-asset")
+    transfer, clusters, asset = (setting.work / f"{name}.zarr" for name in names)
+    for store in (transfer, clusters, asset):
+        shutil.rmtree(store, ignore_errors=True)
+    _run(transfer, "precompute", scene, "-o", transfer, *BOUNCED, "8")
+    return _run(clusters, "cluster", transfer, "-o", clusters), _run(asset, "factorize", clusters, "-o", asset)
+
+
+def _fields(setting: Setting, movers: int) -> Point:
+    store = setting.work / "growth.zarr"
+    shutil.rmtree(store, ignore_errors=True)
+    return _run(store, "precompute", _balls(setting, 1, movers), "-o", store, *FIELDS)
 
 
 def _run(made: Path, *arguments: str | Path) -> Point:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks import mitsuba, sky_matrix
+from benchmarks import mitsuba, sky_matrix, tensors, wavelets
 from benchmarks.receivers import Traceable, sample, share
 from benchmarks.scenes import BUNNY_VERTICES, Setting, write_scene
 from benchmarks.sh_transfer import ORDER, our_transfer, script_transfer
@@ -104,3 +104,43 @@ def test_the_knot_has_as_many_vertices_as_the_bunny(tmp_path, monkeypatch):
     scene, subject = write_scene(Setting(tmp_path, False))
     assert f"{BUNNY_VERTICES:,} vertices" in subject
     assert (scene.parent / "knot.ply").exists()
+
+
+def test_tensorly_errs_as_ours_does():
+    pytest.importorskip("tensorly")
+    from relightcli.core.compress.tucker import hooi
+
+    rng = np.random.default_rng(4)
+    # Falling spectra in all modes: as a random tensor has none to find.
+    x = np.einsum("ai,bi,ci,i->abc", *(rng.standard_normal((n, 8)) for n in (20, 15, 12)), 2.0 ** -np.arange(8))
+    for ranks in ((4, None, 5), (3, 4, 4)):
+        _, theirs = tensors.tensorly_error(x, ranks)
+        ours = tensors.lacking(x, hooi(x, ranks).core)
+        # Both stop when the error stands still: tensorly at 1e-4 of it.
+        assert ours == pytest.approx(theirs, abs=2e-4)
+        assert 0.005 < ours < 0.5
+
+
+def test_what_a_core_lacks():
+    x = np.zeros((2, 2, 2))
+    x[0, 0, 0], x[1, 1, 1] = 4.0, 3.0
+    assert tensors.lacking(x, x[:1, :1, :1]) == pytest.approx(0.6)  # 3 of the 5 that its norm is
+    assert tensors.lacking(x, x) == 0.0
+
+
+def test_pywavelets_has_our_coefficients():
+    pytest.importorskip("pywt")
+    from relightcli.core.sphere import cube, haar
+    from relightcli.core.transport.visibility import horizon_bits
+
+    faces = np.random.default_rng(3).standard_normal((3, 16, 16))
+    # Orthonormal sums of 256 numbers of size 1: round-off of 16 epsilon at most.
+    np.testing.assert_allclose(wavelets.as_array(wavelets.forward_peer(faces)), haar.forward(faces), atol=1e-14)
+    normals = np.array([[0, 1, 0], [0.6, 0.8, 0], [0, 0.6, -0.8]], np.float32)
+    directions = cube.texel_directions(16).reshape(-1, 3).astype(np.float32)
+    solid_angle = cube.solid_angles(16).astype(np.float32).reshape(-1)
+    given = (horizon_bits(normals, 16), normals, directions, solid_angle, 20)
+    _, theirs = wavelets.strongest_peer(*given)
+    _, ours, _ = haar.truncated_cosine_transfer(*given)
+    # Ties may be resolved either way, so that values are compared by size. float32 sums of values below 0.2.
+    np.testing.assert_allclose(np.sort(np.abs(ours)), np.sort(np.abs(theirs)), atol=1e-6)

@@ -75,3 +75,20 @@ def test_unknown_names_are_refused(monkeypatch, capsys):
         program.main()
     assert stop.value.code == 2
     assert "no benchmark named speed" in capsys.readouterr().err
+
+
+def test_ratios_are_written_into_the_page(document, tmp_path, monkeypatch):
+    # The page itself, as it is in the repository: it has the two marks.
+    page, path = tmp_path / "performance.md", tmp_path / "bench.json"
+    page.write_text(program.DOCUMENT.read_text())
+    document["runs"]["full"] = document["runs"]["x"] | {"quick": False}
+    path.write_text(json.dumps(document))
+    monkeypatch.setattr(program, "DOCUMENT", page)
+    monkeypatch.setattr("sys.argv", ["benchmarks", "--document", "--output", str(path)])
+    assert program.main() == 0
+    once = page.read_text()
+    table = once[once.index(report.BEGIN) : once.index(report.END)].splitlines()
+    assert "| full | slow | 8 s |  | 0.5 | <= 4 s | NO |" in table
+    assert not any("neither" in line or line.startswith("| x ") for line in table)  # no ratio; small sizes
+    assert program.main() == 0
+    assert page.read_text() == once
