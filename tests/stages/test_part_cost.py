@@ -14,7 +14,7 @@ from tests.stages.test_asset import CAMERA, ground
 from tests.stages.test_bounces import GOLD
 
 BYTES = 1.2  # set out to be reached
-SECONDS = (0.1, 10.0)  # a sanity check: seconds on machines that others use are rough
+SECONDS = 5.0  # of processors: a check of orders of magnitude, as those on machines that others use are rough
 
 
 @pytest.fixture(scope="module")
@@ -36,8 +36,9 @@ def check(stage, module, store, output, **settings):
     done = stage(module.Config(**config))
     predicted = told["predicted"]
     assert done["bytes"] / BYTES <= predicted["bytes"] <= done["bytes"] * BYTES
-    assert SECONDS[0] * done["seconds"] <= predicted["seconds"] <= SECONDS[1] * done["seconds"]
-    assert predicted["cpu_seconds"] > 0.0
+    spent = sum(step["cpu_seconds"] for step in formats.open_store(output).summary["steps"].values())
+    assert spent / SECONDS <= predicted["cpu_seconds"] <= spent * SECONDS
+    assert predicted["seconds"] > 0.0
     return output
 
 
