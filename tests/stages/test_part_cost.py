@@ -68,11 +68,3 @@ def test_what_grows_is_told_from_what_does_not():
     assert found.cpu_seconds == pytest.approx(2.0 * 1000)
     assert found.bytes == pytest.approx(100.0 + 3.0 * 1000)
     assert grown(part, (10, 10), 10).bytes == 130.0
-
-
-def test_a_finished_store_is_predicted_as_well(transfer):
-    config = cluster.Config(transfer, transfer.parent / "twice.zarr", clusters=3, quiet=True)
-    cluster.cluster(config)
-    before = formats.open_store(config.output).fingerprint
-    assert cluster.cluster(cluster.Config(transfer, config.output, clusters=3, dry_run=True, quiet=True))["predicted"]
-    assert formats.open_store(config.output).fingerprint == before
