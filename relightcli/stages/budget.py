@@ -166,6 +166,8 @@ def _errors(store: formats.Store, found: dict[str, Row]) -> Iterator[tuple[str, 
             yield effect, "rounding", math.sqrt(rounding / total["norm2"])
     if store.kind == "light_clusters" and "check" in found:
         yield "clusters", "of a light overhead", found["check"]["error"]
+    if store.kind == "pose" and "measured_error" in store.attrs:
+        yield "check", "of radiance in poses not learnt from", store.attrs["measured_error"]["share"]
     for block in store.blocks:
         if store.kind == "pose" and block["id"].startswith("fit/"):
             report, name = block["report"], block["model"]["object"]

@@ -22,6 +22,7 @@ FEW, SOME = 16, 64  # receivers whose tensors are gathered
 GROUPED = 1024  # receivers that are put in groups
 DIRECT = (16, 256)  # receivers whose direct light is compressed
 SMALL = 5_000  # receivers of a store all of whose light is looked at
+FEW_CLUSTERS = 4  # that receivers are put in
 LARGER = 3  # clusters that are compressed
 
 
@@ -72,11 +73,20 @@ def predict_cluster(
             tensors = np.concatenate(rows).reshape(len(grouped), -1)
             directions = np.random.default_rng(seed).standard_normal((tensors.shape[1], min(sketch, tensors.shape[1])))
             drawn = tensors @ directions.astype(np.float32)
-        own = max(1, round(clusters * len(grouped) / n))
-        with out.timed(n / len(grouped) * clusters / own):
-            label = cpca(drawn, own, terms, seed).label
-        writer.put("cluster/label", label, dims=("receiver",))
-        out.bytes += stored_bytes(writer, "cluster") * n / len(grouped)
+        own = min(clusters, FEW_CLUSTERS)
+
+        def group(count: int) -> Costs:
+            cost = Costs()
+            with cost.timed():
+                label = cpca(drawn[:count], own, terms, seed).label
+            writer.put("cluster/label", label, dims=("receiver",))
+            cost.bytes = stored_bytes(writer, "cluster")
+            writer.drop("cluster/label")
+            return cost
+
+        grouping = grown(group, (len(drawn) // 2, len(drawn)), n)
+        out.add(Costs(grouping.seconds, grouping.cpu_seconds), clusters / own)
+        out.bytes += grouping.bytes
     return out
 
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
+
 import pytest
 
 import relight_formats as formats
-from relightcli.stages import cluster, factorize, fit_pose
 from relightcli.stages.part_cost import Costs, grown
 from tests.core.transport.scenes import lambert, sphere
 from tests.stages.pose_files import SCENE, pose_scene
@@ -14,43 +18,50 @@ from tests.stages.test_asset import CAMERA, ground
 from tests.stages.test_bounces import GOLD
 
 BYTES = 1.2  # set out to be reached
-SECONDS = (0.1, 10.0)  # a sanity check: seconds on machines that others use are rough
+SECONDS = 5.0  # of processors: a check of orders of magnitude, as those on machines that others use are rough
 
 
 @pytest.fixture(scope="module")
 def transfer(tmp_path_factory):
     parts = {
-        "ground": ground(24, lambert((0.6, 0.5, 0.4))),
-        "gold": sphere(0.35, (0.45, 0.36, 0.1), rings=16, material=GOLD),
+        "ground": ground(16, lambert((0.6, 0.5, 0.4))),
+        "gold": sphere(0.35, (0.45, 0.36, 0.1), rings=12, material=GOLD),
     }
     scene = write_scene(tmp_path_factory.mktemp("scene"), parts, [CAMERA], {}, adjustable=True)
     return make_store(scene, workers=1, bounces=2, light_resolution=32, bounce_resolution=8, subdivide=False)
 
 
-def check(stage, module, store, output, **settings):
+def check(stage, store, output, *options):
     """Runs a stage dry and then in earnest; whether it left nothing before, and took what it said."""
-    config = {"store": store, "output": output, "quiet": True, **settings}
-    told = stage(module.Config(**config, dry_run=True))
+    told = run(stage, store, "-o", output, *options, "--dry-run")
     assert not output.exists()
     assert not output.with_name(output.name + ".partial").exists()
-    done = stage(module.Config(**config))
+    done = run(stage, store, "-o", output, *options)
     predicted = told["predicted"]
     assert done["bytes"] / BYTES <= predicted["bytes"] <= done["bytes"] * BYTES
-    assert SECONDS[0] * done["seconds"] <= predicted["seconds"] <= SECONDS[1] * done["seconds"]
-    assert predicted["cpu_seconds"] > 0.0
+    spent = sum(step["cpu_seconds"] for step in formats.open_store(output).summary["steps"].values())
+    assert spent / SECONDS <= predicted["cpu_seconds"] <= spent * SECONDS
+    assert predicted["seconds"] > 0.0
     return output
 
 
+def run(*command):
+    """What a command says, in a process of its own whose matrix products do not wait for other threads."""
+    line = [sys.executable, "-m", "relightcli", *map(str, command), "--workers", "1", "--json"]
+    env = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+    return json.loads(subprocess.run(line, env=env, check=True, stdout=subprocess.PIPE).stdout)
+
+
 def test_cluster_and_factorize(transfer):
-    clusters = check(cluster.cluster, cluster, transfer, transfer.parent / "clusters.zarr", clusters=6)
-    check(factorize.factorize, factorize, clusters, transfer.parent / "asset.zarr", light_rank=32)
+    clusters = check("cluster", transfer, transfer.parent / "clusters.zarr", "--clusters", 4)
+    check("factorize", clusters, transfer.parent / "asset.zarr", "--light-rank", 16)
 
 
-@pytest.mark.parametrize("tolerance", [None, 0.5])
-def test_fit_pose(tmp_path, tolerance):
+@pytest.mark.parametrize("options", [(), ("--tolerance", 0.5)], ids=["asked", "chosen"])
+def test_fit_pose(tmp_path, options):
     scene = pose_scene(tmp_path, SCENE.replace("size = [20, 16]", "size = [12, 9]"))
     store = make_store(scene, light_resolution=16, pose_directions=64, bounces=0, subdivide=False)
-    check(fit_pose.fit_pose, fit_pose, store, tmp_path / "pose.zarr", tolerance=tolerance)
+    check("fit-pose", store, tmp_path / "pose.zarr", *options)
 
 
 def test_what_grows_is_told_from_what_does_not():
@@ -67,11 +78,3 @@ def test_what_grows_is_told_from_what_does_not():
     assert found.cpu_seconds == pytest.approx(2.0 * 1000)
     assert found.bytes == pytest.approx(100.0 + 3.0 * 1000)
     assert grown(part, (10, 10), 10).bytes == 130.0
-
-
-def test_a_finished_store_is_predicted_as_well(transfer):
-    config = cluster.Config(transfer, transfer.parent / "twice.zarr", clusters=3, quiet=True)
-    cluster.cluster(config)
-    before = formats.open_store(config.output).fingerprint
-    assert cluster.cluster(cluster.Config(transfer, config.output, clusters=3, dry_run=True, quiet=True))["predicted"]
-    assert formats.open_store(config.output).fingerprint == before

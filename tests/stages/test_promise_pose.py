@@ -13,6 +13,7 @@ from relightcli.cli.main import run as run_command
 from relightcli.core.lights.sky import sky_latlong
 from relightcli.errors import InputError
 from relightcli.stages import measured_error
+from relightcli.stages.budget import budget
 from relightcli.stages.fit_pose import Config, fit_pose
 from relightcli.stages.promise_pose import CHECK, CHOSEN, TRIAL, poses_between, smallest
 from relightcli.stages.relight import Config as RelightConfig
@@ -45,6 +46,8 @@ def test_the_tolerance_of_precompute_is_kept_in_other_poses(transfer):
     measured = store.attrs["measured_error"]
     assert done["measured_error"] == measured["share"] <= measured["tolerance"] == TOLERANCE
     assert "bar=bend@" in measured["where"]
+    checked = next(row for row in budget(store) if row["step"] == "check")
+    assert [error["value"] for error in checked["errors"]] == [measured["share"]]
     # A moment and a sky that neither the choice nor the check knows, on all pixels of another camera's view.
     sky = output.parent / "sun.exr"
     write_image(sky, sky_latlong(42.0, 310.0, size=(64, 128)))
