@@ -173,7 +173,8 @@ def prepare(config: Config, account: Account) -> Prepared:
     bounce_cells = 0
     if "one-bounce" in simulated:
         coarse = (config.light_resolution or RESOLUTION) % 16
-        planned = 8 if coarse else effects.bounce_cells(plan, scene.tolerance)
+        textured = any(scene.materials[o.material].diffuse_texture is not None for o in scene.objects.values())
+        planned = 8 if coarse else effects.bounce_cells(plan, scene.tolerance, textured, promise is not None)
         bounce_cells = config.bounce_resolution or planned
     with account.step("reading"):
         moving = _moving(config, scene, promise) if fields.simulate else None

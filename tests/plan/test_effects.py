@@ -266,10 +266,21 @@ def test_names_need_no_pilot():
 
 
 @pytest.mark.parametrize(
-    ("tail", "lobes", "expected"), [(0.1, False, 8), (0.3, False, 16), (0.1, True, 16), (None, False, 16)]
+    ("tail", "lobes", "textured", "promised", "expected"),
+    [
+        (0.35, False, False, False, 8),
+        (0.4, False, False, False, 16),
+        (0.35, False, False, True, 16),
+        (0.25, False, False, True, 8),
+        (0.25, False, True, False, 16),
+        (0.2, False, True, False, 8),
+        (0.1, True, False, False, 16),
+        (None, False, False, False, 16),
+    ],
 )
-def test_cells_are_wide_where_little_light_bounces(tail, lobes, expected):
-    # 6 % of 10 % is less than half of 2 %; of 30 % it is not. Lobes would show the cells.
+def test_cells_are_wide_where_little_light_bounces(tail, lobes, textured, promised, expected):
+    # 3.9 % of it, 6.9 % with textures, may be 1.41 % of all light, half of the square of 2 %; half of 2 % where that is
+    # promised. Lobes would show the cells.
     given = {"bounces": 1} if tail is None else {"bounces": None, "pilot": Measured([tail, 0.0])}
     rows = plan_of(None, faces=BOWL, lobes=lobes, **given).values()
-    assert bounce_cells(list(rows), 0.02) == expected
+    assert bounce_cells(list(rows), 0.02, textured, promised) == expected
