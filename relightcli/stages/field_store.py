@@ -28,6 +28,7 @@ import relight_formats as formats
 from relightcli.core.fields.body import Body
 from relightcli.core.fields.compression import CompressedTransfer, places_of
 from relightcli.core.fields.field import SourceField
+from relightcli.errors import StoreError
 
 CHUNK_BYTES = 4_000_000
 SHELL_STEPS = 2047  # from 0 to the largest number of a shell; the rays of a sample are noisier than half a step
@@ -186,8 +187,12 @@ def copy_field(store: formats.Store, writer: formats.Writer, prefix: str) -> Non
 
 
 def read_field(store: formats.Store, prefix: str = "") -> KeptField:
-    """The field under a prefix of a finished store."""
+    """The field under a prefix of a finished store. Raises StoreError for the form of an earlier version."""
     read: Any = store.read
+    if store.layouts[f"{prefix}self"].dims[-1] != "part":
+        raise StoreError(
+            f"{store.path}: its fields are of an earlier form; expected a store of this version, make it anew"
+        )
     valid = read(f"{prefix}valid")
     hidden = _from_planes(read(f"{prefix}hidden")) * read(f"{prefix}hidden_scale")[:, None, :]
     occlusion = -hidden.reshape(-1, hidden.shape[2])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -277,3 +279,11 @@ def test_clustering_takes_nothing_that_moves(store):
         config = {cluster: ClusterConfig, cluster_lights: LightConfig}[stage]
         with pytest.raises(StoreError, match="objects that may be moved"):
             stage(config(store=store.path, output=output, quiet=True, **settings))
+
+
+def test_fields_of_an_earlier_form_are_refused():
+    old = SimpleNamespace(
+        path="old.zarr", read=None, layouts={"self": SimpleNamespace(dims=("byte", "point", "harmonic"))}
+    )
+    with pytest.raises(StoreError, match=r"old\.zarr: .*earlier form"):
+        read_field(old)
