@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from relightcli.adapters.files import write_atomic
 from relightcli.adapters.images import read_image
 from relightcli.core.measure.noise_free import difference_noise, power, squared_error, squared_error_noise
-from relightcli.errors import InputError, NumericalError
+from relightcli.errors import InputError, NumericalError, StoreError
 
 BEAUTY = ""
 VARIANCE = "variance"
@@ -70,8 +70,14 @@ class PointError:
 
 
 def read_layers(path: Path) -> Layers:
-    """RGB of every layer by name, "" the picture itself. Raises NumericalError for what is not finite."""
-    image = read_image(path)
+    """RGB of every layer by name, "" the picture itself.
+
+    Raises StoreError for a run's picture that is damaged, NumericalError for what is not finite.
+    """
+    try:
+        image = read_image(path)
+    except InputError as error:
+        raise StoreError(f"{error} Delete {path.parent} and give the same command again.") from None
     at = {name: image.pixels[..., k] for k, name in enumerate(image.names)}
     layers = {}
     for name in image.layers():

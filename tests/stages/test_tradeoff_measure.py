@@ -75,3 +75,13 @@ def test_a_command_that_fails_gives_its_own_error_and_message(tmp_path):
     with pytest.raises(InputError, match=r"relightcli precompute: .*none\.toml"):
         runs.make(Step("precompute", ()), 1)
     assert not list(tmp_path.glob("runs/*/record.json"))
+
+
+def test_a_damaged_picture_is_named_with_what_to_do(tmp_path):
+    path = tmp_path / "run" / "picture.exr"
+    path.parent.mkdir()
+    write_image(path, np.ones((8, 8, 3), np.float32))
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(StoreError, match=r"picture\.exr: .*Delete .*run and give the same command again"):
+        read_layers(path)
