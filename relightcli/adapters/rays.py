@@ -16,10 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relightcli.adapters.embree import PacketScene, library
+from relightcli.core.parts import in_parts
 
 # Distance of a ray's origin from its surface, in the normalised frame. Coordinates there are below 1, spaced by at
 # most 2^-24; Embree's robust intersection is exact to a few such spacings.
 SURFACE_OFFSET = 2.0**-19
+MANY = 16_384  # rays that several threads share; fewer are done before another thread wakes
 
 
 @dataclass(frozen=True)
@@ -37,10 +39,11 @@ class Tracer:
     """A committed Embree scene over one indexed mesh.
 
     positions (V, 3) float64 world; faces (F, 3) int32. Zero-area faces are harmless. Non-finite vertices must have
-    been refused before (Embree drops their faces in silence).
+    been refused before (Embree drops their faces in silence). threads: that share many rays, where rays let go of
+    the interpreter's lock; the answers do not depend on them.
     """
 
-    def __init__(self, positions: NDArray[np.float64], faces: NDArray[np.int32]) -> None:
+    def __init__(self, positions: NDArray[np.float64], faces: NDArray[np.int32], threads: int = 1) -> None:
         used = np.zeros(len(positions), bool)
         used[faces] = True
         corners = positions[used] if len(faces) else np.zeros((1, 3))
@@ -49,6 +52,7 @@ class Tracer:
         half = float(np.max(high - low)) * 0.5
         self.scale: float = 2.0 ** -math.ceil(math.log2(half)) if half > 0 else 1.0
         self.empty = len(faces) == 0
+        self.threads = threads if library() else 1
         self._scene: PacketScene | SingleScene | None = None
         if not self.empty:
             vertices, triangles, loaded = self.to_local(positions), np.ascontiguousarray(faces, np.int32), library()
@@ -72,7 +76,16 @@ class Tracer:
         """True (N,) where anything lies along the ray, up to `max_distance` (N,) in units of the direction."""
         if self._scene is None or len(origins) == 0:
             return np.zeros(len(origins), bool)
-        return self._scene.occluded(origins, directions, max_distance)
+        scene, far = self._scene, max_distance
+        if len(origins) < MANY or self.threads == 1:
+            return scene.occluded(origins, directions, far)
+        blocked = np.empty(len(origins), bool)
+
+        def part(a: int, b: int) -> None:
+            blocked[a:b] = scene.occluded(origins[a:b], directions[a:b], None if far is None else far[a:b])
+
+        in_parts(part, len(origins), self.threads)
+        return blocked
 
     def intersect(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> Hits:
         """Nearest hit of every ray. origins, directions (N, 3) float32 in the normalised frame."""
@@ -80,7 +93,17 @@ class Tracer:
         if self._scene is None or n == 0:
             zero = np.zeros(n, np.float32)
             return Hits(np.full(n, -1, np.int32), zero, zero, np.full(n, np.inf, np.float32))
-        return Hits(*self._scene.intersect(origins, directions))
+        scene = self._scene
+        if n < MANY or self.threads == 1:
+            return Hits(*scene.intersect(origins, directions))
+        face, hit = np.empty(n, np.int32), np.empty((3, n), np.float32)
+
+        def part(a: int, b: int) -> None:
+            own = slice(a, b)
+            face[own], hit[0, own], hit[1, own], hit[2, own] = scene.intersect(origins[own], directions[own])
+
+        in_parts(part, n, self.threads)
+        return Hits(face, *hit)
 
 
 class SingleScene:

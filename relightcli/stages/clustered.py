@@ -303,7 +303,8 @@ class _ClusteredSky:
                 seen[doubtful] = True
             elif len(doubtful):
                 if self._tracer is None:
-                    self._tracer = Tracer(self.lighting.geometry.positions, self.lighting.geometry.faces)
+                    geometry = self.lighting.geometry
+                    self._tracer = Tracer(geometry.positions, geometry.faces, self.lighting.threads)
                 tracer = self._tracer
                 origins = tracer.offset(self.lighting.position[doubtful], self.lighting.normal[doubtful])
                 seen[doubtful] = ~tracer.occluded(origins, np.tile(light, (len(doubtful), 1)))

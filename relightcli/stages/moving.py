@@ -94,7 +94,7 @@ class MovingStore(LightingStore):
         keep = ~np.isin(self.geometry.face_object, [self.geometry.object_names.index(m.name) for m in self.movers])
         self._faces = self.geometry.faces[keep]
         self._standing: F64 = self.geometry.positions
-        self._still = Tracer(self._standing, self._faces)
+        self._still = Tracer(self._standing, self._faces, self.threads)
         self._placed: Placement | None = None
         # Without a mesh that is seen from pixels there is a receiver for every vertex that anything can see.
         self._sides = self.receiver_of_vertex()
@@ -480,7 +480,7 @@ class MovingStore(LightingStore):
                     near |= may_block(self.position[:n], *ball(light), *ball(mover))
             rows = np.flatnonzero(near)
             own = np.isin(self.geometry.face_object, [self.geometry.object_names.index(m.name) for m in self.movers])
-            tracer = Tracer(self.geometry.positions, self.geometry.faces[own])
+            tracer = Tracer(self.geometry.positions, self.geometry.faces[own], self.threads)
             bits[rows] &= light_bits(tracer, lights, self.position[rows], self.normal[rows])[0]
             placed.light_bits = bits
         return placed.light_bits, lights

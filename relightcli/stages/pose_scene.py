@@ -62,11 +62,11 @@ class PosedScene:
 
     @cached_property
     def characters(self) -> Tracer:
-        return Tracer(self.geometry.positions, self.own_faces)
+        return Tracer(self.geometry.positions, self.own_faces, self.store.threads)
 
     @cached_property
     def everything(self) -> Tracer:
-        return Tracer(self.geometry.positions, self.faces)
+        return Tracer(self.geometry.positions, self.faces, self.store.threads)
 
     @cached_property
     def buried(self) -> NDArray[np.bool_]:
@@ -138,7 +138,7 @@ class PosedScene:
             others &= np.isin(self.owner, self._skinned)
         if not others.any():
             return None
-        tracer = Tracer(geometry.positions, self.faces[others])
+        tracer = Tracer(geometry.positions, self.faces[others], self.store.threads)
         return trace_visibility(tracer, position, normal, CELLS, REFINE, 0).bits
 
     def _trace(self, tracer: Tracer, rows: NDArray[np.int64], resolution: int, refine: int) -> U8:

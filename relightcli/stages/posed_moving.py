@@ -46,7 +46,7 @@ class PosedMovingStore(MovingStore, PoseStore):
         notes = self._pose(self._asked[1], self.geometry, self.position, self.normal)
         # What hangs on where characters are, and is kept from move to move.
         self._standing = self.geometry.positions
-        self._still, self._sites = Tracer(self._standing, self._faces), Sites(self.movers)
+        self._still, self._sites = Tracer(self._standing, self._faces, self.threads), Sites(self.movers)
         self._bits_of_lights, self._terms, self._undimmed = {}, None, None
         self._placed = self._cosines = None
         if self._suns is not None:

@@ -179,7 +179,7 @@ class Session:
             return _View(camera, matrix, read("picture/coverage"), active, towards)
         geometry = lighting.geometry
         if self._tracer is None:
-            self._tracer = Tracer(geometry.positions, geometry.faces)
+            self._tracer = Tracer(geometry.positions, geometry.faces, lighting.threads)
         normals = primary.face_normals(geometry.positions, geometry.faces)
         film = make_film(camera)
         base = primary.TEXTURE_GRID if geometry.textures else primary.BASE_GRID

@@ -63,6 +63,19 @@ def test_packets_answer_as_single_rays(ball, count):
         assert 100 < hit.sum() < 900
 
 
+def test_threads_answer_as_one(ball, build):
+    one, two = build(*ball), build(*ball, 2)
+    origins, directions = bundle(rays.MANY + 1, 9)
+    far = np.random.default_rng(3).uniform(0.2, 3.0, len(origins)).astype(np.float32)
+    for limit in (None, far):
+        blocked = one.occluded(origins, directions, limit)
+        assert 0 < blocked.sum() < len(blocked)
+        np.testing.assert_array_equal(two.occluded(origins, directions, limit), blocked)
+    found, expected = two.intersect(origins, directions), one.intersect(origins, directions)
+    for name in ("face", "u", "v", "distance"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+
+
 def test_a_fan_is_coherent_and_rays_from_anywhere_are_not():
     packet = embree._scratch()
     valid = packet.view(np.int32)[embree._ROWS * embree.WIDTH :]
