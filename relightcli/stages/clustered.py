@@ -35,7 +35,8 @@ from relightcli.stages.lighting import LightingStore, Radiance, _Coats
 
 PARTLY = 0.25  # of the clusters: if more have changed, all are summed again
 MANY = 64  # cells that are not summed one by one
-KEPT = 256  # points whose visibility is kept
+KEPT = 64  # points whose visibility is kept at least
+ROOM = 64 << 20  # bytes for such
 
 
 class ClusteredStore(LightingStore):
@@ -309,7 +310,7 @@ class _ClusteredSky:
                 origins = tracer.offset(self.lighting.position[doubtful], self.lighting.normal[doubtful])
                 seen[doubtful] = ~tracer.occluded(origins, np.tile(light, (len(doubtful), 1)))
             self._seen[key] = seen
-            while len(self._seen) > KEPT:
+            while len(self._seen) > max(KEPT, ROOM // max(len(seen), 1)):
                 del self._seen[next(iter(self._seen))]
         return self._seen[key]
 

@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "hard-cases.md"
 FIGURES = ROOT / "build" / "hard-cases.json"
 DIGITS = ROOT / "build" / "numerics.json"
-FAULTS = ROOT / "build" / "faults" / "seed-0.jsonl"
+FAULTS = ROOT / "build" / "faults"  # a file for every seed
 ROW = r"^\| [^|]*\| `(\S+)` \| ([^|]*?) ?\| ([^|]*?) ?\|$"  # test, outcome, figure
 FUZZ = ROOT / "build" / "fuzz.json"
 
@@ -96,11 +96,12 @@ def digits() -> str:
 
 
 def faults() -> str:
-    """Trials of `make faults` by command and fault, from its results so far."""
+    """Trials of `make faults` by command and fault, of all seeds, from its results so far."""
     from tests.faults.campaign import GROUPS
     from tests.faults.campaign import table as trials
 
-    rows = [json.loads(line) for line in FAULTS.read_text().splitlines() if line.endswith("}")]
+    lines = [line for path in sorted(FAULTS.glob("seed-*.jsonl")) for line in path.read_text().splitlines()]
+    rows = [json.loads(line) for line in lines if line.endswith("}")]
     groups = ", ".join(f"{sum(r['group'] == group for r in rows)} {group}" for group in GROUPS)
     wrong = sum(bool(r["problem"]) for r in rows)
     return f"{len(rows):,} trials: {groups}; {wrong} violations.\n\n{trials(rows)}"
