@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from relightcli.core.lights.latlong import LUMINANCE, texel_solid_angles
+from relightcli.core.lights.latlong import LUMINANCE, texel_of, texel_solid_angles
 from relightcli.core.lights.points import Points
 from relightcli.core.sphere import cube
 
@@ -44,21 +44,23 @@ def cut(
 ) -> Points:
     """The lit parts of cells (k, 5) of a cube of `resolution`, which hold the flux (k, 3) of a map (H, W, 3).
 
-    The parts share a cell's flux as pixels of the map do whose middles they hold, pixels that are not much smaller than
-    parts cut finer. All flux is kept.
+    A part's share is its solid angle times the mean radiance of the lights in it that pixels are cut into, if they are
+    not much smaller than parts. So even light stays even, and all flux is kept.
     """
     turn = math.radians(math.fmod(rotate_degrees, 360.0))
     solid = texel_solid_angles(*radiance.shape[:2]) if len(cells) else np.zeros(0)
     directions, light = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for (face, r0, r1, c0, c1), whole in zip(np.asarray(cells).tolist(), flux, strict=True):
         rows, columns = (2.0 * x / resolution - 1.0 for x in (_borders(r0, r1), _borders(c0, c1)))
-        grid = np.zeros((len(rows) - 1, len(columns) - 1, 3))
+        grid = np.zeros((len(rows) - 1, len(columns) - 1, 4))
         axes = np.stack([cube.FACE_AXIS[face], cube.FACE_RIGHT[face], cube.FACE_DOWN[face]])
         narrow = min(rows[1] - rows[0], columns[1] - columns[0]) / FINE
         finer = min(max(math.ceil(math.pi / radiance.shape[0] / narrow), 1), FINEST)
         about = _pixels_about(face, columns, rows, radiance.shape, turn)
         _sum_pixels(radiance, solid, turn, axes, rows, columns, finer, *about, grid)
-        part = grid.reshape(-1, 3)
+        s0, s1, t0, t1 = columns[None, :-1], columns[None, 1:], rows[:-1, None], rows[1:, None]
+        area = cube.rectangle_solid_angles(s0, s1, t0, t1, (s1 - s0) * (t1 - t0))
+        part = (grid[..., :3] / grid[..., 3:] * area[..., None]).reshape(-1, 3)
         total = part.sum(axis=0)
         share = np.where(total > 0.0, part / np.where(total > 0.0, total, 1.0), 1.0 / len(part))
         s, t = (0.5 * (x[1:] + x[:-1]) for x in (columns, rows))
@@ -96,7 +98,7 @@ def _pixels_about(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sum_pixels(radiance, solid, turn, axes, rows, columns, finer, top, bottom, left, count, out):  # type: ignore[no-untyped-def]
-    """Flux of pixels, each as finer x finer lights and not below 0, into parts (i, j, 3)."""
+    """Flux of pixels, each as finer x finer lights and not below 0, and their solid angles, into parts (i, j, 4)."""
     height, width = radiance.shape[0], radiance.shape[1]
     across, down = (len(columns) - 1) / (columns[-1] - columns[0]), (len(rows) - 1) / (rows[-1] - rows[0])
     for column in range(left, left + count):
@@ -120,3 +122,17 @@ def _sum_pixels(radiance, solid, turn, axes, rows, columns, finer, top, bottom, 
                     if 0 <= i < len(rows) - 1 and 0 <= j < len(columns) - 1:
                         for c in range(3):
                             out[i, j, c] += weight * max(radiance[row, own, c], np.float32(0.0))
+                        out[i, j, 3] += weight
+    for i in range(len(rows) - 1):
+        for j in range(len(columns) - 1):
+            if out[i, j, 3] == 0.0:  # in the middle of a large pixel
+                s, t = 0.5 * (columns[j] + columns[j + 1]), 0.5 * (rows[i] + rows[i + 1])
+                d = (
+                    axes[0, 0] + s * axes[1, 0] + t * axes[2, 0],
+                    axes[0, 1] + s * axes[1, 1] + t * axes[2, 1],
+                    axes[0, 2] + s * axes[1, 2] + t * axes[2, 2],
+                )
+                row, own = texel_of(height, width, turn, d)
+                for c in range(3):
+                    out[i, j, c] = max(radiance[row, own, c], np.float32(0.0))
+                out[i, j, 3] = 1.0
