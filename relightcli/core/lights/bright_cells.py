@@ -48,16 +48,17 @@ def cut(
     not much smaller than parts. So even light stays even, and all flux is kept.
     """
     turn = math.radians(math.fmod(rotate_degrees, 360.0))
-    solid = texel_solid_angles(*radiance.shape[:2]) if len(cells) else np.zeros(0)
+    height = radiance.shape[0]
+    solid, sines = texel_solid_angles(*radiance.shape[:2]), np.cos(math.pi * np.arange(height + 1) / height)
     directions, light = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for (face, r0, r1, c0, c1), whole in zip(np.asarray(cells).tolist(), flux, strict=True):
         rows, columns = (2.0 * x / resolution - 1.0 for x in (_borders(r0, r1), _borders(c0, c1)))
         grid = np.zeros((len(rows) - 1, len(columns) - 1, 4))
         axes = np.stack([cube.FACE_AXIS[face], cube.FACE_RIGHT[face], cube.FACE_DOWN[face]])
         narrow = min(rows[1] - rows[0], columns[1] - columns[0]) / FINE
-        finer = min(max(math.ceil(math.pi / radiance.shape[0] / narrow), 1), FINEST)
+        finer = min(max(math.ceil(math.pi / height / narrow), 1), FINEST)
         about = _pixels_about(face, columns, rows, radiance.shape, turn)
-        _sum_pixels(radiance, solid, turn, axes, rows, columns, finer, *about, grid)
+        _sum_pixels(radiance, solid, sines, turn, axes, rows, columns, finer, *about, grid)
         s0, s1, t0, t1 = columns[None, :-1], columns[None, 1:], rows[:-1, None], rows[1:, None]
         area = cube.rectangle_solid_angles(s0, s1, t0, t1, (s1 - s0) * (t1 - t0))
         part = (grid[..., :3] / grid[..., 3:] * area[..., None]).reshape(-1, 3)
@@ -97,7 +98,7 @@ def _pixels_about(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _sum_pixels(radiance, solid, turn, axes, rows, columns, finer, top, bottom, left, count, out):  # type: ignore[no-untyped-def]
+def _sum_pixels(radiance, solid, sines, turn, axes, rows, columns, finer, top, bottom, left, count, out):  # type: ignore[no-untyped-def]
     """Flux of pixels, each as finer x finer lights and not below 0, and their solid angles, into parts (i, j, 4)."""
     height, width = radiance.shape[0], radiance.shape[1]
     across, down = (len(columns) - 1) / (columns[-1] - columns[0]), (len(rows) - 1) / (rows[-1] - rows[0])
@@ -107,10 +108,9 @@ def _sum_pixels(radiance, solid, turn, axes, rows, columns, finer, top, bottom, 
             longitude = math.pi * (1.0 - 2.0 * (column + (b + 0.5) / finer) / width) + turn
             sin_l, cos_l = math.sin(longitude), math.cos(longitude)
             for row in range(top, bottom):
-                upper, lower = math.cos(math.pi * row / height), math.cos(math.pi * (row + 1) / height)
                 weight = solid[row] / (finer * finer)
                 for a in range(finer):
-                    y = upper + (lower - upper) * (a + 0.5) / finer
+                    y = sines[row] + (sines[row + 1] - sines[row]) * (a + 0.5) / finer
                     level = math.sqrt(max(1.0 - y * y, 0.0))
                     x, z = sin_l * level, cos_l * level
                     w = x * axes[0, 0] + y * axes[0, 1] + z * axes[0, 2]
