@@ -134,7 +134,7 @@ class AssetStore(LightingStore):
         """The sky, and the same spread over neighbouring texels (`environment.splat`)."""
         if self._lit is None or self._lit[0] is not environment or self._lit[1] != rotate:
             sky = latlong_to_cube(environment, self.resolution, rotate)
-            self._lit = (environment, rotate, sky, splat(sky))
+            self._lit = (environment, rotate, sky, splat(sky, self.threads))
         return self._lit[2:]
 
     def _direct_tensors(

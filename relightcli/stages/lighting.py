@@ -376,7 +376,7 @@ class LightingStore:
     ) -> NDArray[np.float32]:
         """Specular light of the sky at `rows`, integrated from the bits, (N, 3); 0 elsewhere."""
         specular = np.zeros((len(self), 3), np.float32)
-        tree = sky_tree(splat(sky), environment, rotate)
+        tree = sky_tree(splat(sky, self.threads), environment, rotate)
         for block, bits in self.blocks(needed=self._mask(rows)):
             pick = rows[(rows >= block.start) & (rows < block.stop)]
             if len(pick):
@@ -557,7 +557,7 @@ class LightingStore:
 
     def _irradiance(self, sky: SkyCube, active: NDArray[np.bool_] | None, basis: str) -> NDArray[np.float32]:
         if basis == "visibility":
-            prefix = moment_prefix(splat(sky))
+            prefix = moment_prefix(splat(sky, self.threads))
             out = np.zeros((len(self), 3), np.float32)
             for rows, bits in self.blocks(needed=active):
                 mask = None if active is None else active[rows]

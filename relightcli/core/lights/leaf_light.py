@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from relightcli.core.lights.environment import half_angle, half_angles_table, merge_strip, take_column
+from relightcli.core.lights.environment import half_angle, half_angles_table
 from relightcli.core.lights.quadtree import Tree, leaf_of_texel
 from relightcli.core.parts import in_parts
 
@@ -110,11 +110,79 @@ def _walk(radiance, strips, columns, borders, south, tree, row_edges, row_half_a
         rows = (south[column, 0], south[column, 1])
         if column != held:
             held = column
-            take_column(radiance, column, rows, light)
+            _take_column(radiance, column, rows, light)
         count = _meridian(tree, math.sin(middle), math.cos(middle), table, edges, half_angles, leaves)
-        merge_strip(
+        _merge_strip(
             light, rows, row_edges, row_half_angles, edges, half_angles, leaves, count, middle, high - low, out
         )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _take_column(radiance, column, rows, light):  # type: ignore[no-untyped-def]
+    """Pixels of a column of a map (H, W, 3), from rows[0] to rows[1] counted from the south pole, to light (H, 3)."""
+    for row in range(rows[0], rows[1]):
+        for c in range(3):
+            light[row, c] = radiance[len(light) - 1 - row, column, c]
+
+
+@njit(cache=True, nogil=True)
+def _merge_strip(  # type: ignore[no-untyped-def]
+    light, rows, row_edges, row_half_angles, edges, half_angles, places, count, middle, width, out
+):
+    """Adds the light of a column's pixels, in a strip of `width` radians about the longitude `middle`, to the places
+    that the meridian meets.
+
+    light (H, 3) float64: of `_take_column`, the pixels from rows[0] to rows[1] take part. row_edges (H + 1,):
+    s = sin(latitude) of the rows' borders; edges: the same of the `count` places; half_angles: antiderivatives of
+    cos(latitude) over s there. out (P, 3, 4): per place and colour the flux and the moment.
+    """
+    # integral of (sin, cos) of the longitude over the strip
+    wx = 2.0 * math.sin(middle) * math.sin(0.5 * width)
+    wz = 2.0 * math.cos(middle) * math.sin(0.5 * width)
+    row, k = rows[0], 0
+    s, below = row_edges[row], row_half_angles[row]
+    if edges[0] > s:
+        high = rows[1]  # row_edges[row] <= edges[0] < row_edges[high]
+        while high - row > 1:
+            half = (row + high) >> 1
+            if row_edges[half] <= edges[0]:
+                row = half
+            else:
+                high = half
+        s, below = edges[0], half_angles[0]
+    while k + 1 < count and edges[k + 1] <= s:
+        k += 1
+    while row < rows[1] and k < count:
+        end = edges[k + 1]
+        # of a place, per colour: light over s, over s times cos(latitude), over s^2 / 2
+        r0 = r1 = r2 = g0 = g1 = g2 = b0 = b1 = b2 = 0.0
+        while True:
+            whole = row_edges[row + 1] <= end
+            top = row_edges[row + 1] if whole else end
+            above = row_half_angles[row + 1] if whole else half_angles[k + 1]
+            if top > s:
+                area, across, level = top - s, above - below, 0.5 * (top * top - s * s)
+                red, green, blue = light[row, 0], light[row, 1], light[row, 2]
+                r0, r1, r2 = r0 + red * area, r1 + red * across, r2 + red * level
+                g0, g1, g2 = g0 + green * area, g1 + green * across, g2 + green * level
+                b0, b1, b2 = b0 + blue * area, b1 + blue * across, b2 + blue * level
+                s, below = top, above
+            if not whole:
+                break
+            row += 1
+            if row == rows[1]:
+                break
+        to = out[places[k]]
+        to[0, 0], to[0, 1], to[0, 2], to[0, 3] = (
+            to[0, 0] + width * r0, to[0, 1] + wx * r1, to[0, 2] + width * r2, to[0, 3] + wz * r1
+        )  # fmt: skip
+        to[1, 0], to[1, 1], to[1, 2], to[1, 3] = (
+            to[1, 0] + width * g0, to[1, 1] + wx * g1, to[1, 2] + width * g2, to[1, 3] + wz * g1
+        )  # fmt: skip
+        to[2, 0], to[2, 1], to[2, 2], to[2, 3] = (
+            to[2, 0] + width * b0, to[2, 1] + wx * b1, to[2, 2] + width * b2, to[2, 3] + wz * b1
+        )  # fmt: skip
+        k += 1
 
 
 @njit(cache=True, nogil=True)

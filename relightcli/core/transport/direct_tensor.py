@@ -257,23 +257,26 @@ def _transform(face, scratch, resolution, count):  # type: ignore[no-untyped-def
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
 def _direct_light(index, scale, value, light, out):  # type: ignore[no-untyped-def]
-    keep = index.shape[1]
+    keep, count = index.shape[1], value.shape[1]
     red, green, blue = np.empty(keep, np.float32), np.empty(keep, np.float32), np.empty(keep, np.float32)
     for i in range(len(index)):
         for j in range(keep):
             t = index[i, j]
             red[j], green[j], blue[j] = light[t, 0], light[t, 1], light[t, 2]
-        for k in range(value.shape[1]):
-            row = value[i, k]
-            r = g = b = np.float32(0.0)
+        for k in range(0, count, 2):  # two factors share what is loaded of the light; a last one goes twice
+            m = min(k + 1, count - 1)
+            one, two = value[i, k], value[i, m]
+            r = g = b = x = y = z = np.float32(0.0)
             for j in range(keep):
-                v = np.float32(row[j])
+                v, w = np.float32(one[j]), np.float32(two[j])
                 r += v * red[j]
                 g += v * green[j]
                 b += v * blue[j]
-            out[i, k, 0] = scale[i, k] * r
-            out[i, k, 1] = scale[i, k] * g
-            out[i, k, 2] = scale[i, k] * b
+                x += w * red[j]
+                y += w * green[j]
+                z += w * blue[j]
+            out[i, k, 0], out[i, k, 1], out[i, k, 2] = scale[i, k] * r, scale[i, k] * g, scale[i, k] * b
+            out[i, m, 0], out[i, m, 1], out[i, m, 2] = scale[i, m] * x, scale[i, m] * y, scale[i, m] * z
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
