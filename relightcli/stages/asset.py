@@ -187,9 +187,18 @@ class AssetStore(LightingStore):
         seen = np.take(view, tensors.lobed, axis=0)
         uniform = tensors.uniform if tensors.uniform is not None else np.zeros((len(seen), 3), np.float32)
         found: list[NDArray[np.float32]] = []
-        for k, local in enumerate(tensors.local):
+        for k, light in enumerate(tensors.light):
             both = shade_low_order(
-                rows, local, uniform, tensors.lobed_normal, seen, tables, colour, tensors.lobed_material, self.threads
+                rows,
+                light,
+                uniform,
+                tensors.lobed_normal,
+                seen,
+                tables,
+                colour,
+                tensors.lobed_material,
+                self.threads,
+                tensors.rotations,
             )
             found.append(both[0])
             if k == 0 and tensors.uniform is not None:
@@ -205,9 +214,9 @@ class AssetStore(LightingStore):
 class _Tensors:
     """The asset's tensors in memory, receivers in the order of their clusters, and what has been made of them.
 
-    even: per bounce (N, 3), irradiance over pi, in the receivers' own order; local: (n, 3, S), harmonics in the frames
-    of the receivers with a lobe, `lobed` (n,), for one bounce, and for two if it has harmonics; uniform (n, 3), the
-    second bounce's value if it has none.
+    even: per bounce (N, 3), irradiance over pi, in the receivers' own order; light: (n, 3, S), harmonics at the
+    receivers with a lobe, `lobed` (n,), for one bounce, and for two if it has harmonics; uniform (n, 3), the second
+    bounce's value if it has none.
     """
 
     def __init__(self, asset: AssetStore) -> None:
@@ -223,8 +232,8 @@ class _Tensors:
         self.q = len(asset.channels.material)
         self.rows = [_factors(asset.store, "one_bounce/receiver_factor")[cluster, place]]
         self.light_factor = _factors(asset.store, "one_bounce/light_factor")
-        core = _factors(asset.store, "one_bounce/core")
-        self.core = core.reshape(*core.shape[:2], -1)
+        self.core: NDArray[np.int8] = read("one_bounce/core")
+        self.core_scale: Factors = read("one_bounce/core_scale")[..., 0]
         self.second: Factors | None = None
         if asset.bounces > 1:
             self.rows.append(_factors(asset.store, "two_bounce/receiver_factor")[cluster, place])
@@ -244,7 +253,7 @@ class _Tensors:
         turned = np.swapaxes(rotations[may_shine], 1, 2).reshape(-1, asset.order**4)  # column after column
         self.rotations = np.ascontiguousarray(turned[:, kept])
         self.even: list[NDArray[np.float32]] = []
-        self.local: list[NDArray[np.float32]] = []
+        self.light: list[NDArray[np.float32]] = []
         self.uniform: NDArray[np.float32] | None = None
         self._sky: SkyCube | None = None
         self._weights: NDArray[np.float64] | None = None
@@ -271,12 +280,8 @@ class _Tensors:
 
         light = matched(0, self.basis.T @ cell_radiance(sky.flux, sky.resolution, CELLS))
         reduced = np.matmul(light.T, self.light_factor)  # (C, 3, light eigenvectors)
-        one = np.empty((len(reduced), 3, self.core.shape[2]), np.float32)
-
-        def contract(a: int, b: int) -> None:
-            np.matmul(reduced[a:b], self.core[a:b], out=one[a:b])
-
-        in_parts(contract, len(one), threads)
+        one = np.zeros((len(reduced), 3, *self.core.shape[2:]), np.float32)
+        in_parts(lambda a, b: _contract(a, b, self.core, self.core_scale, reduced, one), len(one), threads)
         self._one = one.reshape(len(one), 3, -1, self.q, self.asset.order**2)
         if self.second is not None:
             light = matched(1, cell_radiance(sky.flux, sky.resolution, COARSE))
@@ -289,7 +294,7 @@ class _Tensors:
         self._weights = weights
         h = weights.astype(np.float32)
         assert self._one is not None
-        self.even, self.local, self.uniform = [], [], None
+        self.even, self.light, self.uniform = [], [], None
         self._spread(self.rows[0], np.einsum("ckvqs,qk->cvks", self._one, h, optimize=True))
         if self._two is not None:
             c, r = self._two.shape[:2]
@@ -303,21 +308,18 @@ class _Tensors:
         k = len(self.even)
         if len(self._room) == k:  # memory is taken once: fresh pages would cost more than filling them
             self._room.append(np.empty((len(self.lobed), 3, s), np.float32))
-        local = self._room[k]
+        light = self._room[k]
         even = np.empty((len(rows), 3), np.float32)  # not taken from there: what was made of the old one is told by it
 
         def part(a: int, b: int) -> None:
-            _spread(
-                a, b, rows, self.start, flat, self.even_weights, self.receiver, even, self.lobe_row,
-                self.rotations, local,
-            )  # fmt: skip
+            _spread(a, b, rows, self.start, flat, self.even_weights, self.receiver, even, self.lobe_row, light)
 
         in_parts(part, c, self.asset.threads)
         self.even.append(even)
         if s == 1:
-            self.uniform = local[:, :, 0]
+            self.uniform = np.maximum(light[:, :, 0], np.float32(0.0))
         else:
-            self.local.append(local)
+            self.light.append(light)
 
 
 @njit(cache=True, nogil=True)
@@ -342,9 +344,38 @@ def _factors(store: formats.Store, name: str) -> Factors:
     return values
 
 
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+def _contract(first, last, core, scale, light, out):  # type: ignore[no-untyped-def]
+    """Light (C, 3, L) into the cores of clusters first to last: codes (C, L, V, S) int8 in steps of scale (C, L, V).
+    Adds to out (C, 3, V, S). Four eigenvectors of light at a time: the codes are read once, as the bytes they are."""
+    count, zero = core.shape[1], np.float32(0.0)
+    for c in range(first, last):
+        for group in range(0, count, 4):
+            k0, k1, k2, k3 = group, min(group + 1, count - 1), min(group + 2, count - 1), min(group + 3, count - 1)
+            for v in range(core.shape[2]):
+                s0, s1 = scale[c, k0, v], scale[c, k1, v] if group + 1 < count else zero
+                s2, s3 = scale[c, k2, v] if group + 2 < count else zero, scale[c, k3, v] if group + 3 < count else zero
+                codes0, codes1, codes2, codes3 = core[c, k0, v], core[c, k1, v], core[c, k2, v], core[c, k3, v]
+                of = light[c]
+                r0, r1, r2, r3 = of[0, k0] * s0, of[0, k1] * s1, of[0, k2] * s2, of[0, k3] * s3
+                g0, g1, g2, g3 = of[1, k0] * s0, of[1, k1] * s1, of[1, k2] * s2, of[1, k3] * s3
+                b0, b1, b2, b3 = of[2, k0] * s0, of[2, k1] * s1, of[2, k2] * s2, of[2, k3] * s3
+                red, green, blue = out[c, 0, v], out[c, 1, v], out[c, 2, v]
+                for m in range(core.shape[3]):
+                    w, x, y, z = (
+                        np.float32(codes0[m]),
+                        np.float32(codes1[m]),
+                        np.float32(codes2[m]),
+                        np.float32(codes3[m]),
+                    )
+                    red[m] += r0 * w + r1 * x + r2 * y + r3 * z
+                    green[m] += g0 * w + g1 * x + g2 * y + g3 * z
+                    blue[m] += b0 * w + b1 * x + b2 * y + b3 * z
+
+
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
-def _spread(first, last, rows, start, flat, even_weights, receiver, even, lobe_row, rotations, local):  # type: ignore[no-untyped-def]
-    """From the vectors of clusters first to last to their receivers: even, and in the receivers' frames."""
+def _spread(first, last, rows, start, flat, even_weights, receiver, even, lobe_row, light):  # type: ignore[no-untyped-def]
+    """From the vectors of clusters first to last to their receivers: even light of all, harmonics where a lobe is."""
     size = flat.shape[2]
     count = size // 3
     room = np.empty((ROWS, size), np.float32)
@@ -357,37 +388,12 @@ def _spread(first, last, rows, start, flat, even_weights, receiver, even, lobe_r
                 world = room[i - low]
                 row = lobe_row[i]
                 for colour in range(3):
-                    light = world[colour * count : (colour + 1) * count]
-                    total = light[0]  # of a uniform value: the mean itself
+                    of = world[colour * count : (colour + 1) * count]
+                    total = of[0]  # of a uniform value: the mean itself
                     if count > 1:
                         total = zero
                         for k in range(count):
-                            total += even_weights[i, k] * light[k]
+                            total += even_weights[i, k] * of[k]
                     even[receiver[i], colour] = max(total, zero)
                     if row >= 0:
-                        target = local[row, colour]
-                        if count == 1:
-                            target[0] = max(total, zero)
-                            continue
-                        if count == 16:  # four bands, their loops unrolled
-                            _turn(rotations[row], 0, light, 0, target, 1)
-                            _turn(rotations[row], 1, light, 1, target, 3)
-                            _turn(rotations[row], 10, light, 4, target, 5)
-                            _turn(rotations[row], 35, light, 9, target, 7)
-                            continue
-                        at = low = band = 0
-                        while low < count:
-                            n = 2 * band + 1  # harmonics of the band
-                            _turn(rotations[row], at, light, low, target, n)
-                            at += n * n
-                            low, band = low + n, band + 1
-
-
-@njit(cache=True, nogil=True, inline="always", fastmath={"reassoc", "contract", "nsz"})
-def _turn(rotation, at, light, low, target, n):  # type: ignore[no-untyped-def]
-    """A band of n harmonics, from `low` on, turned by the matrix from `at` on, column after column."""
-    for j in range(n):
-        total = np.float32(0.0)
-        for k in range(n):
-            total += rotation[at + k * n + j] * light[low + k]
-        target[low + j] = total
+                        light[row, colour, :] = of

@@ -77,25 +77,30 @@ def shade_low_order(
     colour: NDArray[np.float32],
     material: NDArray[np.int32],
     threads: int = 1,
+    rotation: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
     """Specular exit radiance (2, n, 3) float32 towards view (n, 3): of light (n, 3, order^2) in the receivers' frames,
     and of light that is the same from everywhere, uniform (n, 3). Of the receivers `rows` alone; of others 0.
 
-    normals (n, 3); table (M, POLAR, B) from `response`; colour (M, 3), the specular colour; material (n,).
+    normals (n, 3); table (M, POLAR, B) from `response`; colour (M, 3), the specular colour; material (n,). rotation
+    (n, sum of (2 l + 1)^2), if given, takes the light into the frames: band after band, of each matrix column after
+    column. The response goes back through it, which is a third of the work.
     """
     out = np.zeros((2, len(light), 3), np.float32)
     order = math.isqrt(light.shape[2])
+    turn = np.zeros((0, 0), np.float32) if rotation is None else rotation
 
     def part(a: int, b: int) -> None:
-        _shade(rows[a:b], light, uniform, normals, view, table, colour, material, order, out)
+        _shade(rows[a:b], light, uniform, normals, view, table, colour, material, order, turn, out)
 
     in_parts(part, len(rows), threads)
     return out
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
-def _shade(rows, light, uniform, normals, view, table, colour, material, order, out):  # type: ignore[no-untyped-def]
+def _shade(rows, light, uniform, normals, view, table, colour, material, order, turn, out):  # type: ignore[no-untyped-def]
     c, s = np.empty(order, np.float32), np.empty(order, np.float32)
+    response, turned = np.empty(order * order, np.float32), np.empty(order * order, np.float32)
     even = np.float32(math.sqrt(4.0 * math.pi))
     for i in rows:
         axes = axes_of((np.float64(normals[i, 0]), np.float64(normals[i, 1]), np.float64(normals[i, 2])))
@@ -117,17 +122,32 @@ def _shade(rows, light, uniform, normals, view, table, colour, material, order, 
         g = int(place)
         f = np.float32(place - g)
         low, high = table[material[i], g], table[material[i], g + 1]
-        r = gr = b = np.float32(0.0)
         k = 0
         for band in range(order):
             middle = band * (band + 1)
             for m in range(band + 1):
                 w = low[k] + f * (high[k] - low[k])
                 k += 1
-                wc, ws = w * c[m], w * s[m]
-                r += wc * light[i, 0, middle + m] + ws * light[i, 0, middle - m]
-                gr += wc * light[i, 1, middle + m] + ws * light[i, 1, middle - m]
-                b += wc * light[i, 2, middle + m] + ws * light[i, 2, middle - m]
+                response[middle + m] = w * c[m]
+                if m:
+                    response[middle - m] = w * s[m]
+        if len(turn):
+            at = 0
+            for band in range(order):
+                first, n = band * band, 2 * band + 1
+                for k in range(n):
+                    total = np.float32(0.0)
+                    for j in range(n):
+                        total += turn[i, at + k * n + j] * response[first + j]
+                    turned[first + k] = total
+                at += n * n
+        else:
+            turned[:] = response
+        r = gr = b = np.float32(0.0)
+        for k in range(order * order):
+            r += turned[k] * light[i, 0, k]
+            gr += turned[k] * light[i, 1, k]
+            b += turned[k] * light[i, 2, k]
         m = material[i]
         out[0, i, 0], out[0, i, 1], out[0, i, 2] = r * colour[m, 0], gr * colour[m, 1], b * colour[m, 2]
         w = even * (low[0] + f * (high[0] - low[0]))
