@@ -142,7 +142,7 @@ def _split(row: Callable[[str], Row], cost: Row) -> None:
             continue
         moved: dict[str, float] = {"rays": cost[f"{part}_rays"]}
         for key in ("seconds", "cpu_seconds"):
-            moved[key] = whole[key] * cost[f"{part}_{key}"] / cost[key] if cost[key] else 0.0
+            moved[key] = whole[key] * cost.get(f"{part}_{key}", 0.0) / cost[key] if cost[key] else 0.0
         for key, value in moved.items():
             row(step)[key] += value
             row("visibility")[key] -= value
