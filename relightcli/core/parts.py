@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import TypeVar
 
@@ -44,6 +46,36 @@ def side_by_side(first: Callable[[], A], second: Callable[[], B], threads: int) 
     with ThreadPoolExecutor(1) as beside:
         later = beside.submit(second)
         return first(), later.result()
+
+
+def in_order(work: Callable[[A], B], items: Sequence[A], threads: int) -> Generator[B]:
+    """work(item) of every item, in their order; as many as there are threads are in work or wait to be taken."""
+    if threads <= 1:
+        yield from map(work, items)
+        return
+    pool, coming = ThreadPoolExecutor(threads), deque[Future[B]]()
+    try:
+        for item in items:
+            if len(coming) == threads:
+                yield coming.popleft().result()
+            coming.append(pool.submit(work, item))
+        while coming:
+            yield coming.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Products and decompositions inside stay on the thread that asks for them: threads of this file do the rest.
+
+    BLAS's own threads wait for work by spinning, which costs several times the work where matrices are small or others
+    use the machine, and sums depend on their number.
+    """
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(1, user_api="blas"):
+        yield
 
 
 @lru_cache(maxsize=4)

@@ -20,6 +20,7 @@ from relightcli.adapters.files import need_output
 from relightcli.core.brdf.transport_basis import FUNCTIONS
 from relightcli.core.compress.cpca import cpca
 from relightcli.core.compress.tucker import gram_spectrum
+from relightcli.core.parts import in_order, one_blas_thread
 from relightcli.errors import InputError, StoreError
 from relightcli.run.accounting import Account, Meter
 from relightcli.stages.budget import summary
@@ -55,6 +56,7 @@ class Config:
     quiet: bool = False
 
 
+@one_blas_thread()
 def cluster(config: Config) -> dict[str, Any]:
     """Runs the stage; returns a summary. Raises InputError, StoreError, NumericalError, OSError."""
     started, account = time.perf_counter(), Account()
@@ -110,7 +112,7 @@ def cluster(config: Config) -> dict[str, Any]:
             with account.step("groups"):
                 meter = Meter()
                 rows = _sketch(setup, config)
-                found = cpca(rows, clusters, TERMS, config.seed)
+                found = cpca(rows, clusters, TERMS, config.seed, config.workers)
                 label = split_large(rows, found.label, int(LARGEST * len(rows) / found.count) + 1)
                 writer.put("cluster/label", label, dims=("receiver",))
                 left = float(np.sqrt(found.residuals[-1] / found.norm2)) if found.norm2 else 0.0
@@ -213,15 +215,19 @@ def _light_basis(setup: TransferSetup, tolerance: float, seed: int) -> tuple[NDA
     for face in range(6):
         own = slice(face * CELLS * CELLS, (face + 1) * CELLS * CELLS)
         sources = setup.sources(np.eye(cells, dtype=np.float32)[:, own])
-        part = setup.gather_rows(picked, sources, ORDER)[..., : CELLS * CELLS]
-        tensors[:, :, own] = part.reshape(len(picked), -1, CELLS * CELLS)
+        found = setup.gather_rows(picked, sources, ORDER)[..., : CELLS * CELLS]
+        tensors[:, :, own] = found.reshape(len(picked), -1, CELLS * CELLS)
         del sources
     half = max(1, len(picked) // 2)
     rows = tensors[:half].reshape(-1, cells)
     gram = np.zeros((cells, cells))
-    for a in range(0, len(rows), 1 << 14):
-        part = rows[a : a + (1 << 14)].astype(np.float64)
-        gram += part.T @ part
+
+    def square(first: int) -> NDArray[np.float64]:
+        part = rows[first : first + (1 << 14)].astype(np.float64)
+        return part.T @ part
+
+    for part in in_order(square, range(0, len(rows), 1 << 14), setup.threads):
+        gram += part
     values, vectors = gram_spectrum(gram)
     left = np.sqrt(np.maximum(0.0, 1.0 - np.cumsum(values) / max(values.sum(), 1e-300)))
     rank = int(np.argmax(left <= tolerance)) + 1 if (left <= tolerance).any() else len(values)
@@ -239,7 +245,11 @@ def _sketch(setup: TransferSetup, config: Config) -> NDArray[np.float32]:
     rng = np.random.default_rng(config.seed)
     directions = rng.standard_normal((size, min(SKETCH, size))).astype(np.float32) / np.float32(np.sqrt(SKETCH))
     out = np.empty((n, directions.shape[1]), np.float32)
-    for start in range(0, n, BLOCK):
+
+    def project(start: int) -> None:
         rows = np.arange(start, min(start + BLOCK, n))
         out[rows] = setup.gather_rows(rows, sources, ORDER).reshape(len(rows), -1) @ directions
+
+    for _ in in_order(project, range(0, n, BLOCK), setup.threads):
+        pass
     return out

@@ -8,6 +8,8 @@ Everything is quantised; every cluster records what compression and quantisation
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,7 @@ import relight_formats as formats
 from relightcli import __version__
 from relightcli.adapters.files import need_output
 from relightcli.core.compress.tucker import sequential_hosvd
+from relightcli.core.parts import in_order, one_blas_thread
 from relightcli.core.transport.direct_tensor import KEEP
 from relightcli.core.transport.transfer import Sources, light_fit
 from relightcli.errors import InputError, StoreError
@@ -67,6 +70,7 @@ class Config:
     quiet: bool = False
 
 
+@one_blas_thread()
 def factorize(config: Config) -> dict[str, Any]:
     """Runs the stage; returns a summary. Raises InputError, StoreError, NumericalError, OSError."""
     started, account = time.perf_counter(), Account()
@@ -242,8 +246,8 @@ def _one_bounce(
         return
     sources = setup.sources(basis)
     _put_fit(writer, "one_bounce", setup, sources)
-    for c in todo:
-        meter = Meter()
+
+    def compress(c: int) -> dict[str, float]:
         rows = order[start[c] : start[c + 1]]
         tensor = setup.gather_rows(rows, sources, bands).reshape(len(rows), rest, lights)
         found = sequential_hosvd(tensor, (rank_v, None, rank_l))
@@ -255,16 +259,9 @@ def _one_bounce(
         back = np.einsum("lvq,nv->nlq", kept["core"], kept["receiver_factor"][: len(rows)], optimize=True)
         back = np.einsum("ml,nlq->nqm", kept["light_factor"], back, optimize=True)
         error2 = float(((tensor - back).astype(np.float64) ** 2).sum())
-        writer.record(
-            f"one-bounce/{c}",
-            {
-                **meter.read(),
-                "receivers": len(rows),
-                "norm2": found.norm2,
-                "compression2": found.error2,
-                "error2": error2,
-            },
-        )
+        return {"receivers": len(rows), "norm2": found.norm2, "compression2": found.error2, "error2": error2}
+
+    _record(writer, "one-bounce", compress, todo, setup.threads)
 
 
 def _put_fit(writer: formats.Writer, group: str, setup: TransferSetup, sources: Sources) -> None:
@@ -306,8 +303,8 @@ def _two_bounces(
     lights = setup.sources(coarse_cells())
     _put_fit(writer, "two_bounce", setup, lights)
     sources = setup.second_sources(lights, bands)
-    for c in todo:
-        meter = Meter()
+
+    def compress(c: int) -> dict[str, float]:
         rows = order[start[c] : start[c + 1]]
         tensor = setup.gather_rows(rows, sources, second_order).reshape(len(rows), size, 1)
         found = sequential_hosvd(tensor, (rank, None, None))
@@ -316,16 +313,20 @@ def _two_bounces(
         kept = outputs.put(c, {"receiver_factor": u_v, "core": found.core[:, :, 0]})
         back = kept["receiver_factor"][: len(rows)] @ kept["core"]
         error2 = float(((tensor[:, :, 0] - back).astype(np.float64) ** 2).sum())
-        writer.record(
-            f"two-bounce/{c}",
-            {
-                **meter.read(),
-                "receivers": len(rows),
-                "norm2": found.norm2,
-                "compression2": found.error2,
-                "error2": error2,
-            },
-        )
+        return {"receivers": len(rows), "norm2": found.norm2, "compression2": found.error2, "error2": error2}
+
+    _record(writer, "two-bounce", compress, todo, setup.threads)
+
+
+def _record(
+    writer: formats.Writer, name: str, compress: Callable[[int], dict[str, float]], clusters: list[int], threads: int
+) -> None:
+    """Compresses clusters, several at a time. A cluster's costs are all that was spent since the one before it."""
+    meter = Meter()
+    with closing(in_order(compress, clusters, threads)) as results:
+        for c, found in zip(clusters, results, strict=True):
+            writer.record(f"{name}/{c}", {**meter.read(), **found})
+            meter = Meter()
 
 
 class _Outputs:

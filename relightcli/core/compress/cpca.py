@@ -9,11 +9,13 @@ it. Neither step can raise the total residual.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from relightcli.core.compress.tucker import gram_spectrum
+from relightcli.core.parts import in_order
 from relightcli.errors import NumericalError
 
 ROUNDS = 12
@@ -33,7 +35,7 @@ class Clusters:
     norm2: float
 
 
-def cpca(rows: NDArray[np.floating], clusters: int, terms: int, seed: int = 0) -> Clusters:
+def cpca(rows: NDArray[np.floating], clusters: int, terms: int, seed: int = 0, threads: int = 1) -> Clusters:
     """Groups rows (N, D) into at most `clusters`, each with `terms` eigenvectors, from k-means++ centres.
 
     A cluster that loses all its rows takes the worst row of the others. Raises NumericalError if the rows are not
@@ -51,8 +53,8 @@ def cpca(rows: NDArray[np.floating], clusters: int, terms: int, seed: int = 0) -
     label = _nearest(x, square, _plus_plus(x, square, clusters, np.random.default_rng(seed)))
     residuals: list[float] = []
     for _ in range(ROUNDS):
-        subspaces = [_subspace(x[label == c], terms) for c in range(clusters)]
-        label, least = _assign(x, square, subspaces)
+        subspaces = list(in_order(partial(_subspace, x, label, terms), range(clusters), threads))
+        label, least = _assign(x, square, subspaces, threads)
         residuals.append(float(least.sum()))
         if len(residuals) > 1 and residuals[-1] > residuals[-2] + _ROUND_OFF * norm2:
             raise NumericalError(
@@ -72,8 +74,11 @@ def cpca(rows: NDArray[np.floating], clusters: int, terms: int, seed: int = 0) -
     return Clusters(compact.astype(np.int32), len(used), tuple(residuals), norm2)
 
 
-def _subspace(own: NDArray[np.float64], terms: int) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Mean (D,) and leading eigenvectors (D, up to terms) of rows; None without rows."""
+def _subspace(
+    x: NDArray[np.float64], label: NDArray[np.int32], terms: int, cluster: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Mean (D,) and leading eigenvectors (D, up to terms) of a cluster's rows; None without rows."""
+    own = x[label == cluster]
     if not len(own):
         return None
     mean = own.mean(0)
@@ -89,13 +94,15 @@ def _assign(
     x: NDArray[np.float64],
     square: NDArray[np.float64],
     subspaces: list[tuple[NDArray[np.float64], NDArray[np.float64]] | None],
+    threads: int,
 ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """The cluster (N,) that leaves least of every row, and what it leaves (N,)."""
     label, least = np.empty(len(x), np.int32), np.empty(len(x))
     found = [(c, *subspace) for c, subspace in enumerate(subspaces) if subspace is not None]
     columns = np.concatenate([np.column_stack([mean, vectors]) for _, mean, vectors in found], axis=1)
-    for a in range(0, len(x), _BLOCK):
-        rows = slice(a, a + _BLOCK)
+
+    def part(first: int) -> None:
+        rows = slice(first, first + _BLOCK)
         products = x[rows] @ columns
         distance = np.empty((len(products), len(found)))
         at = 0
@@ -106,6 +113,9 @@ def _assign(
         nearest = distance.argmin(1)
         label[rows] = np.array([c for c, _, _ in found])[nearest]
         least[rows] = np.maximum(distance[np.arange(len(nearest)), nearest], 0.0)
+
+    for _ in in_order(part, range(0, len(x), _BLOCK), threads):
+        pass
     return label, least
 
 

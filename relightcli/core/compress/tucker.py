@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import eigh
+from scipy.linalg import eigh, lu
 
 from relightcli.errors import NumericalError
 
@@ -106,13 +106,20 @@ def _leading(flat: NDArray[np.float32], rank: int) -> NDArray[np.float64]:
     if width == n:  # no subspace to look for: all of it is asked for
         return gram_spectrum(mode_gram(flat[:, :, None], 0))[1][:, :rank]
     block = np.random.default_rng(0).standard_normal((m, width)).astype(np.float32)
-    q = np.linalg.qr(flat @ block)[0]
-    for _ in range(_POWER):
-        q = np.linalg.qr(flat @ np.linalg.qr(flat.T @ q)[0])[0]
+    q = flat @ block
+    for _ in range(_POWER):  # between two products any well-conditioned basis will do, and LU is the cheapest
+        q = flat @ _basis(flat.T @ _basis(q))
+    q = np.linalg.qr(q)[0]
     small = (q.T @ flat).astype(np.float64)
     _, vectors = gram_spectrum(small @ small.T)
     found: NDArray[np.float64] = np.linalg.qr(q.astype(np.float64) @ vectors[:, :rank])[0]  # float32 is not orthonormal
     return signed(found)
+
+
+def _basis(columns: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Another basis (n, w) of what the columns span: unit lower triangular but for the order of rows."""
+    found: NDArray[np.float32] = lu(columns, permute_l=True, check_finite=False)[0]
+    return found
 
 
 def pair_safe_rank(spectrum: NDArray[np.float64], rank: int) -> int:
