@@ -118,8 +118,8 @@ def test_constant_map_stays_constant(size, resolution, largest, rms):
     np.testing.assert_allclose(sky.moment.sum(0), 0, atol=1e-13)
 
 
-@pytest.mark.parametrize("r", [5, 16])
-def test_texels_hold_the_light_of_their_own_solid_angle(r):
+@pytest.mark.parametrize(("r", "rms"), [(5, 6e-3), (16, 2e-3)])  # strips are 9 and 2.8 degrees wide
+def test_texels_hold_the_light_of_their_own_solid_angle(r, rms):
     # Against 24 x 24 points in every texel of a coarse map: its pixels' borders cross texels everywhere.
     pixels = np.random.default_rng(3).random((6, 12, 3)).astype(np.float32)
     n, rotate = 24, 20.0
@@ -135,7 +135,7 @@ def test_texels_hold_the_light_of_their_own_solid_angle(r):
     solid_angle = cube.solid_angles(r)[..., None]
     # 24 columns of points resolve a border to 1/48 of the texel, times the pixels' difference of up to 1.
     assert np.abs((sky.flux.reshape(6, r, r, 3) - flux) / solid_angle).max() < 0.025
-    assert np.sqrt((((sky.flux.reshape(6, r, r, 3) - flux) / solid_angle) ** 2).mean()) < 2e-3
+    assert np.sqrt((((sky.flux.reshape(6, r, r, 3) - flux) / solid_angle) ** 2).mean()) < rms
     moment = np.einsum("fijc,fijx->fijcx", light, d).reshape(6, r, n, r, n, 3, 3).sum((2, 4))
     assert np.abs((sky.moment.reshape(6, r, r, 3, 3) - moment) / solid_angle[..., None]).max() < 0.025
 
