@@ -136,10 +136,12 @@ def described(path: object) -> Iterator[None]:
 class LightingStore:
     """An open transfer store. Reads what it needs when it needs it; keeps small visibility in memory.
 
-    apart: whether the entries of `exit_radiance` are wanted one by one, or no more than their sum.
+    apart: whether the entries of `exit_radiance` are wanted one by one, or no more than their sum. streams: whether
+    what receivers see of each other may be read again for every interreflection.
     """
 
     apart = True
+    streams = True
 
     def __init__(self, store: Path | formats.Store, threads: int) -> None:
         self.store = formats.open_store(store) if isinstance(store, Path) else store
@@ -300,10 +302,11 @@ class LightingStore:
         coats = self._coats_of(materials)
         if coats.shiny.any() and view is None:
             raise InputError("a material with a specular lobe looks different from everywhere: a --camera is needed")
-        gather = self.gather(self.pixels) if bounces else None
-        lit = active if gather is None else None
+        streamed = bool(bounces) and self.streams and self._hit_bytes() > IN_MEMORY
+        gather = self.gather(self.pixels) if bounces and not streamed else None
+        lit = active if gather is None and not streamed else None
         direct = self._direct(environment, rotate, coats, view, active, lit, basis or self.basis)
-        if gather is None:
+        if gather is None and not streamed:
             return [direct, *[Radiance(np.zeros_like(direct.diffuse), None)] * bounces]
         return [direct, *self._bounces(gather, direct, environment, rotate, coats, view, active, bounces)]
 
@@ -419,7 +422,7 @@ class LightingStore:
 
     def _bounces(
         self,
-        gather: Gather,
+        gather: Gather | None,
         direct: Radiance,
         environment: NDArray[np.float32],
         rotate: float,
@@ -428,19 +431,21 @@ class LightingStore:
         active: NDArray[np.bool_] | None,
         bounces: int,
     ) -> Iterator[Radiance]:
-        """Exit radiance after each of `bounces` interreflections of the directly lit receivers."""
+        """Exit radiance after each of `bounces` interreflections of the directly lit receivers. Without `gather`, which
+        memory need not hold, it is made again for each of them, part by part."""
         # Loaded here: pictures of direct light need not wait for them.
         from relightcli.core.brdf.separable import TERMS
-        from relightcli.core.shade.bounces import Exit, bounce
+        from relightcli.core.shade.bounces import Exit, Received, bounce
         from relightcli.core.shade.lobe_factors import lobe_factors, lobe_rows, local_lobes, sky_lobes
 
-        table = widen(coats.table, 0.5 * np.pi / gather.cells)
+        cells = self.store.layouts["bounce/hit"].shape[2] if gather is None else gather.cells
+        table = widen(coats.table, 0.5 * np.pi / cells)
         factors = lobe_factors(table)
         first = self.pixels  # light comes from the receivers after these only, so that only they need room for lobes
         row = np.roll(lobe_rows(np.roll(coats.material, -first), factors), first)
         lobe = np.zeros((int(row[first:].max()) + 1, 6, TERMS), np.float32)
         if len(lobe):
-            sky = splat(latlong_to_cube(environment, gather.cells, rotate))
+            sky = splat(latlong_to_cube(environment, cells, rotate))
             for block, bits in self.blocks(first):
                 sky_lobes(bits, self.normal[block], coats.material[block], factors, sky, lobe, row[block], self.threads)
             lights_seen = self._local_lights()
@@ -462,15 +467,22 @@ class LightingStore:
         if coats.partner is not None:
             mask = mask | mask[coats.partner]
 
-        def send(who: Gather, at: int, light: Exit, go_on: bool) -> tuple[NDArray[np.float32], ...]:
+        def send(who: Gather, at: int, light: Exit, go_on: bool, into: Received | None = None) -> Received:
             material, threads = coats.material, self.threads
-            return bounce(who, light, self.normal, material, table, factors, view, mask, go_on, threads, at)
+            return bounce(who, light, self.normal, material, table, factors, view, mask, go_on, threads, at, into)
+
+        def send_to_all(light: Exit, go_on: bool) -> Received:
+            received = None
+            for at, who in self._some_gathers(first, len(self)) if gather is None else [(first, gather)]:
+                received = send(who, at, light, go_on, received)
+            assert received is not None
+            return received
 
         lights: list[Exit] = []
         arrived = []
         for number in range(1, bounces + 1):
             light = Exit(diffuse if tint is None else diffuse * tint, lobe, row)
-            e, specular, lobe = send(gather, first, light, number < bounces)
+            e, specular, lobe = send_to_all(light, number < bounces)
             diffuse = self._reflected(coats, view, light, factors, e, specular)
             if first:
                 lights.append(light)
@@ -512,7 +524,7 @@ class LightingStore:
         if first not in self._gathered:
             from relightcli.core.shade.gather import join
 
-            step = len(self) if self.store.layouts["bounce/hit"].raw_bytes <= IN_MEMORY else self._chunk
+            step = len(self) if self._hit_bytes() <= IN_MEMORY else self._chunk
             self._gathered[first] = join([part for _, part in self._gathers(first, len(self), step)])
         return self._gathered[first]
 
@@ -527,15 +539,22 @@ class LightingStore:
                 seen = bits[start - block.start : rows.stop - block.start]
                 yield start, build_gather(np.asarray(hits[rows]), seen, self.normal[rows], self.threads)
 
+    def _some_gathers(self, first: int, last: int) -> Iterator[tuple[int, Gather]]:
+        """`_gathers` of some receivers at a time, so that there are no more than ENTRIES."""
+        return self._gathers(first, last, max(1, ENTRIES // int(np.prod(self.store.layouts["bounce/hit"].shape[1:]))))
+
+    def _hit_bytes(self) -> int:
+        """Of whom the receivers see, in memory."""
+        return self.store.layouts["bounce/hit"].raw_bytes if "bounce/hit" in self.store else 0
+
     def _pixel_gathers(self) -> Iterator[tuple[int, Gather]]:
         """Whom the receivers of pixels see, part by part; kept for the next frame if that takes no more than
         IN_MEMORY."""
         if self._seen is not None:
             yield from self._seen
             return
-        cells = int(np.prod(self.store.layouts["bounce/hit"].shape[1:]))
         kept, size = [], 0
-        for at, part in self._gathers(0, self.pixels, max(1, ENTRIES // cells)):
+        for at, part in self._some_gathers(0, self.pixels):
             size += part.source.nbytes + part.cell.nbytes + part.cosine.nbytes + part.solid_angle.nbytes
             if size <= IN_MEMORY:
                 kept.append((at, part))

@@ -80,6 +80,7 @@ class _Passed:
 class MovingStore(LightingStore):
     """An open store with fields, with the interface of `LightingStore`."""
 
+    streams = False  # what is seen depends on the places, and is kept
     _moved: Geometry | None
 
     def __init__(self, store: Path | formats.Store, threads: int) -> None:

@@ -50,6 +50,8 @@ DIFFUSE = 1.0  # the exponent by which phong's kernel is lambert's
 class PoseStore(LightingStore):
     """An open pose store, with the interface of `LightingStore`."""
 
+    streams = False  # what is seen depends on the poses, and is kept
+
     def __init__(self, store: Path | formats.Store, threads: int) -> None:
         super().__init__(store, threads)
         self._rest = (self.geometry, self.position, self.normal)

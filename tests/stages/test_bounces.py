@@ -66,6 +66,16 @@ NAMES = ("direct", "specular", "one_bounce", "two_bounce")
 EDIT = ("ground.diffuse=0.2,0.6,0.3", "ball.diffuse=0.8,0.8,0.7", "gold.roughness=0.5", "gold.specular=0.5,0.7,0.9")
 
 
+def test_what_memory_need_not_hold_is_read_again(store, monkeypatch):
+    # Sums at a receiver have the same order, whatever part of the others it comes with.
+    whole = layers_of(store, "whole.exr", settings=EDIT)
+    monkeypatch.setattr("relightcli.stages.lighting.IN_MEMORY", 0)
+    monkeypatch.setattr("relightcli.stages.lighting.ENTRIES", 1 << 17)
+    parts = layers_of(store, "parts.exr", settings=EDIT)
+    for name in NAMES:
+        np.testing.assert_array_equal(parts[name], whole[name])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("edit", [(), EDIT], ids=["as it is", "edited"])
 def test_every_layer_against_the_path_tracer(store, edit):

@@ -40,6 +40,9 @@ class Exit(NamedTuple):
     row: NDArray[np.int32]
 
 
+Received = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+
+
 def bounce(
     gather: Gather,
     light: Exit,
@@ -52,17 +55,21 @@ def bounce(
     go_on: bool,
     threads: int = 1,
     first: int = 0,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    into: Received | None = None,
+) -> Received:
     """One interreflection of the exit radiance `light`, at the receivers from `first` on that `gather` is about.
 
     Returns the irradiance (N, 3) float32; the specular exit radiance towards `view` (N, 3) of the `active` receivers
     (N,), with its colour, (N, 3) float32; and, to `go_on`, what the light factors gather, (G, 6, K), else nothing of
     it. Receivers that are not active are left out unless it goes on. The lobe of `light` has places for all that light
     comes from, and, to go on, for all that it reaches; of others the row need only not be negative if they shine.
+    into: what the same light gave other receivers, to which this is added in place.
     """
     n = len(normals)
-    irradiance, specular = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
-    lobe = np.zeros(light.lobe.shape if go_on else (0, *light.lobe.shape[1:]), np.float32)
+    if into is None:
+        lobes = light.lobe.shape if go_on else (0, *light.lobe.shape[1:])
+        into = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32), np.zeros(lobes, np.float32)
+    irradiance, specular, lobe = into
     directions = cube.texel_directions(gather.cells).reshape(-1, 3)
     towards = np.zeros((n, 3), np.float32) if view is None else view
     looked_at = active if view is not None else np.zeros(n, bool)
@@ -90,7 +97,7 @@ def bounce(
         )
 
     in_parts(part, len(gather.start) - 1, threads)
-    return irradiance, specular, lobe
+    return into
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

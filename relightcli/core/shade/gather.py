@@ -87,18 +87,18 @@ def build_gather(
 
 
 def join(parts: list[Gather]) -> Gather:
-    """The entries of consecutive ranges of receivers in one."""
+    """The entries of consecutive ranges of receivers in one. The list is emptied: no more than one column is in memory
+    twice."""
     if len(parts) == 1:
         return parts[0]
-    counts = np.concatenate([np.diff(part.start) for part in parts])
-    return Gather(
-        parts[0].cells,
-        np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-        np.concatenate([part.source for part in parts]),
-        np.concatenate([part.cell for part in parts]),
-        np.concatenate([part.cosine for part in parts]),
-        np.concatenate([part.solid_angle for part in parts]),
-    )
+    cells, counts = parts[0].cells, np.concatenate([np.diff(part.start) for part in parts])
+    columns = [list(column) for column in zip(*(part[2:] for part in parts), strict=True)]
+    parts.clear()
+    whole: list[NDArray[Any]] = []
+    for column in columns:
+        whole.append(np.concatenate(column))
+        column.clear()
+    return Gather(cells, np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), *whole)
 
 
 def replace_rows(gather: Gather, rows: NDArray[np.int64], part: Gather) -> Gather:
