@@ -29,6 +29,7 @@ ARRAYS = {
     "light/": "light-basis",
     "cluster/": "groups",
     "light_clusters/": "clusters",
+    "light_factors/": "factors",
     "one_bounce/": "one-bounce",
     "two_bounce/": "two-bounce",
 }
@@ -43,6 +44,7 @@ BLOCKS = {
     "lobe": "clusters",
     **{f"{part}-{name}": "clusters" for part in ("diffuse", "lobes") for name in ("roots", "refine")},
     "check": "clusters",
+    "light_factors": "factors",
 }
 # Work that blocks of visibility tell apart, by the prefix of what they record.
 PARTS = {"light": "local lights", "bounce": "bounces"}
