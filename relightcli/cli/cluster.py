@@ -107,10 +107,7 @@ def _light_text(result: dict[str, Any]) -> str:
     if result.get("dry_run"):
         text = f"{result['receivers']} receivers, {6 * result['resolution'] ** 2} lights"
         if "shining_receivers" in result:
-            text += (
-                f"; lobes of {result['shining_receivers']} receivers, {options.bytes_text(result['factor_raw_bytes'])} "
-                "before compression"
-            )
+            text += f", factors for {result['shining_receivers']} receivers"
         return text
     if result["status"] == "up to date":
         return f"{result['store']} is up to date"

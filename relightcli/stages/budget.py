@@ -44,7 +44,6 @@ BLOCKS = {
     "lobe": "clusters",
     **{f"{part}-{name}": "clusters" for part in ("diffuse", "lobes") for name in ("roots", "refine")},
     "check": "clusters",
-    "light_factors": "factors",
 }
 # Work that blocks of visibility tell apart, by the prefix of what they record.
 PARTS = {"light": "local lights", "bounce": "bounces"}

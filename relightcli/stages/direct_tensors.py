@@ -17,12 +17,14 @@ from relightcli.core.brdf.models import MaterialTable, widen
 from relightcli.core.lights.environment import SkyCube
 from relightcli.core.shade.bright import Bright, add_irradiance, split_bright
 from relightcli.core.transport.direct_tensor import direct_light, direct_transfer, light_coefficients
-from relightcli.core.transport.lobe_visibility import lobe_visibility
+from relightcli.core.transport.lobe_visibility import lobe_visibility, table_side
 from relightcli.run.accounting import Meter
-from relightcli.stages.family import BLOCK, Family, families_of, lobe_arrays, put_model, put_receivers, receiver_array
+from relightcli.stages.brdf_data import direct_model
+from relightcli.stages.family import Family, families_of, put_family
 from relightcli.stages.lighting import LightingStore
 
 PLACE, MATTE = "direct", "matte"
+BLOCK = 2048  # receivers
 
 
 def group_of(lighting: LightingStore) -> dict[str, NDArray[np.int64]]:
@@ -46,21 +48,33 @@ def put_direct(
         if name == MATTE:
             factors = LightFactors(np.full((2, 2, 1), 1.0 / np.pi, np.float32), np.ones(1, np.float32))
             degrees: list[float] = []
+            writer.put(f"{PLACE}/{name}/receiver", receivers.astype(np.int32), dims=(f"{name}_receiver",))
         else:
-            model = put_model(writer, PLACE, name, ranks)
+            model = direct_model(name, ranks)
+            put_family(writer, PLACE, name, model, receivers)
             factors, degrees = light_factors(model), model.degrees.tolist()
         count, n = factors.table.shape[2], len(receivers)
         texels = 6 * lighting.resolution**2
         kept = min(keep, texels)
-        put_receivers(writer, PLACE, name, receivers)
 
         def array(leaf: str, shape: tuple[int, ...], dtype: str, dims: tuple[str, ...], name: str = name) -> Any:
-            return receiver_array(writer, PLACE, name, leaf, shape, dtype, dims)
+            return writer.array(
+                f"{PLACE}/{name}/{leaf}",
+                shape=shape,
+                dtype=dtype,
+                chunks=(BLOCK, *shape[1:]),
+                dims=(f"{name}_receiver", *dims),
+                codec="zstd",
+            )
 
         index = array("index", (n, kept), "uint16" if texels <= 1 << 16 else "int32", ("coefficient",))
         scale = array("scale", (n, count), "float32", ("factor",))
         value = array("value", (n, kept, count), "int8", ("coefficient", "factor"))  # compresses better this way round
-        lobes = lobe_arrays(writer, PLACE, name, n, degrees)
+        wide = [d for d in degrees if d > 0.0]
+        lobes = [
+            array(f"lobe_{d:g}", (n, table_side(d), table_side(d)), "uint8", (f"row_{d:g}", f"column_{d:g}"))
+            for d in wide
+        ]
         for start in range(0, n, BLOCK):
             block = f"{PLACE}/{name}-{start}"
             if block in writer.done:

@@ -1,13 +1,13 @@
-"""Receivers of one family of BRDFs with a tensor: what a store keeps of them however their incident light is made, and
-what they send towards a view. [Sun 2007, Eq. 3, sec. 4.1]
+"""Receivers of one family of BRDFs with a tensor: what they send towards a view, however their incident light is made.
+[Sun 2007, Eq. 3, sec. 4.1]
 
-A store keeps the family's model, and the visible shares of its lobes. Where the light of the factors comes from is the
-business of assets (`direct_tensors`) and of clustered lights (`light_factors`).
+A store keeps the family's model. Where the light of the factors comes from, and what stands for the lobes that factors
+cannot hold, is the business of assets (`direct_tensors`) and of clustered lights (`light_factors`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from typing import Any
 
 import numpy as np
@@ -21,12 +21,13 @@ from relightcli.core.brdf.models import SPECULAR as SPECULAR_COLUMN
 from relightcli.core.lights.environment import SkyCube
 from relightcli.core.lights.prefiltered import prefiltered_sky
 from relightcli.core.shade.bright import Bright, add_highlights
+from relightcli.core.shade.sampled_lobes import Lobe, Skies, make_lobe, make_shares, sample_lobes
 from relightcli.core.transport.direct_tensor import shade_direct
-from relightcli.core.transport.lobe_visibility import add_lobes, table_side
-from relightcli.stages.brdf_data import direct_model
+from relightcli.core.transport.lobe_visibility import add_lobes
 from relightcli.stages.lighting import LightingStore
 
-BLOCK = 2048  # receivers
+BROAD = (0.35, 0.5)  # roughness from which lobes are partly, and wholly, those of the factors where others are sampled
+BLACK = np.zeros(3, np.float32)
 
 
 def families_of(lighting: LightingStore) -> dict[str, NDArray[np.int64]]:
@@ -38,55 +39,39 @@ def families_of(lighting: LightingStore) -> dict[str, NDArray[np.int64]]:
     return {name: np.flatnonzero(family == name) for name in FAMILIES if (family == name).any()}
 
 
-def put_model(writer: formats.Writer, place: str, name: str, ranks: tuple[int, int, int] | None = None) -> DirectModel:
-    """Makes the model of a family, and writes it into the group `place`. ranks: see `brdf_data.direct_model`."""
-    model = direct_model(name, ranks)
+def put_family(writer: formats.Writer, place: str, name: str, model: DirectModel, receivers: NDArray[np.int64]) -> None:
+    """Writes a model and its receivers (n,) into the group `place`."""
     for leaf, values in model.arrays().items():
         writer.put(f"{place}/{name}/brdf/{leaf}", values, dims=ARRAYS[leaf])
-    return model
-
-
-def put_receivers(writer: formats.Writer, place: str, name: str, receivers: NDArray[np.int64]) -> None:
-    """Writes which receivers (n,) are of the family."""
     writer.put(f"{place}/{name}/receiver", receivers.astype(np.int32), dims=(f"{name}_receiver",))
 
 
-def receiver_array(
-    writer: formats.Writer, place: str, name: str, leaf: str, shape: tuple[int, ...], dtype: str, dims: tuple[str, ...]
-) -> Any:
-    """A new array of values of the receivers, in chunks of BLOCK."""
-    return writer.array(
-        f"{place}/{name}/{leaf}",
-        shape=shape,
-        dtype=dtype,
-        chunks=(BLOCK, *shape[1:]),
-        dims=(f"{name}_receiver", *dims),
-        codec="zstd",
-    )
+class NarrowLobes:
+    """Lobes of a family's receivers by a few directions each, for what is narrower than the factors can hold."""
 
+    def __init__(self, name: str, bits: NDArray[np.uint8], threads: int) -> None:
+        self.name = name
+        self.shares = make_shares(bits, threads)
+        self.skies: Skies
+        self._lobes: dict[tuple[float, ...], Lobe] = {}
 
-def lobe_arrays(writer: formats.Writer, place: str, name: str, count: int, degrees: Sequence[float]) -> list[Any]:
-    """New arrays for what `lobe_visibility` gives of `count` receivers."""
-    return [
-        receiver_array(
-            writer,
-            place,
-            name,
-            f"lobe_{d:g}",
-            (count, table_side(d), table_side(d)),
-            "uint8",
-            (f"row_{d:g}", f"column_{d:g}"),
-        )
-        for d in degrees
-        if d > 0.0
-    ]
+    def part(self, values: tuple[float, ...]) -> float:
+        """How much of a material's lobe is left to them, 0 to 1."""
+        roughness = math.sqrt(2.0 / (values[0] + 2.0)) if self.name == "blinn-phong" else values[1]
+        low, high = BROAD
+        return min(max((high - roughness) / (high - low), 0.0), 1.0)
+
+    def lobe(self, values: tuple[float, ...]) -> Lobe:
+        if values not in self._lobes:
+            self._lobes = {**dict(list(self._lobes.items())[-3:]), values: make_lobe(self.name, *values)}
+        return self._lobes[values]
 
 
 class Family:
     """n receivers of a family in memory, under a light.
 
     receiver (n,) rising; normal (n, 3); incident (n, K+1, 3): I0, radiance times sr sr^-1, the last that of the diffuse
-    factor: to be set for every light; skies: of the lobes.
+    factor: to be set for every light; skies: of the model's lobes; narrow: what stands for them where it has none.
     """
 
     def __init__(self, lighting: LightingStore, place: str, name: str) -> None:
@@ -103,6 +88,7 @@ class Family:
         self.tables = tuple(read(f"{group}/lobe_{d:g}") for d in self.degrees if d > 0.0)
         self.incident = np.zeros((len(self.receiver), self.model.light.shape[1] + 1, 3), np.float32)
         self.skies: tuple[NDArray[np.float32], ...] = ()
+        self.narrow = None if self.degrees else NarrowLobes(name, self.bits, lighting.threads)
         self.out = np.empty((len(self.receiver), 3), np.float32)
         self._settings: dict[tuple[float, ...], MaterialSetting] = {}
 
@@ -114,7 +100,7 @@ class Family:
         self,
         table: MaterialTable,
         wide: MaterialTable,
-        bright: Bright | None,
+        bright: Bright,
         view: NDArray[np.float32],
         active: NDArray[np.bool_] | None,
         threads: int,
@@ -125,7 +111,6 @@ class Family:
         wide: the table as highlights of `bright` have it, texels whose light is not in that of the factors.
         """
         towards = np.take(view, self.receiver, axis=0)
-        black = np.zeros(3, np.float32)
         if active is not None:
             self.out[:] = 0.0
         for m, all_rows in self.rows.items():
@@ -135,26 +120,26 @@ class Family:
             if table.model[m] != self.code or not colour.any():
                 self.out[rows] = 0.0
                 continue
-            values = (row[SHININESS],) if self.name == "blinn-phong" else (row[F0], row[ROUGHNESS])
-            if values not in self._settings:
-                self._settings = {values: setting(self.model, *(float(v) for v in values))}
-            tables = self._settings[values]
-            shade_direct(self.incident, towards, self.normal, rows, tables.view_table, colour, black, self.out, threads)
-            add_lobes(
-                self.bits,
-                self.tables,
-                self.skies,
-                self.degrees,
-                towards,
-                self.normal,
-                rows,
-                tables.energy,
-                colour,
-                self.out,
-                threads,
-            )
-            np.maximum(self.out, 0.0, out=self.out)  # of truncation
-            if bright is not None and len(bright.texel):
+            columns = (SHININESS,) if self.name == "blinn-phong" else (F0, ROUGHNESS)
+            values = tuple(float(row[column]) for column in columns)
+            narrow = 0.0 if self.narrow is None else self.narrow.part(values)
+            if narrow < 1.0:
+                self._broad(rows, towards, values, colour * np.float32(1.0 - narrow), threads)
+            else:
+                self.out[rows] = 0.0
+            if self.narrow is not None and narrow > 0.0:
+                sample_lobes(
+                    self.narrow.shares,
+                    self.narrow.skies,
+                    towards,
+                    self.normal,
+                    rows,
+                    self.narrow.lobe(values),
+                    colour * np.float32(narrow),
+                    self.out,
+                    threads,
+                )
+            if len(bright.texel):
                 add_highlights(
                     self.bits,
                     rows,
@@ -168,3 +153,32 @@ class Family:
                     threads,
                 )
         return self.out
+
+    def _broad(
+        self,
+        rows: NDArray[np.int64],
+        towards: NDArray[np.float32],
+        values: tuple[float, ...],
+        colour: NDArray[np.float32],
+        threads: int,
+    ) -> None:
+        """Sets out[rows] to what the factors give, with the model's lobes."""
+        if values not in self._settings:
+            self._settings = {values: setting(self.model, *values)}
+        tables = self._settings[values]
+        shade_direct(self.incident, towards, self.normal, rows, tables.view_table, colour, BLACK, self.out, threads)
+        if self.degrees:
+            add_lobes(
+                self.bits,
+                self.tables,
+                self.skies,
+                self.degrees,
+                towards,
+                self.normal,
+                rows,
+                tables.energy,
+                colour,
+                self.out,
+                threads,
+            )
+        np.maximum(self.out, 0.0, out=self.out)  # of truncation

@@ -33,7 +33,7 @@ from relightcli.run.accounting import Account, Meter
 from relightcli.stages.budget import summary
 from relightcli.stages.cluster import copy_arrays
 from relightcli.stages.light_cluster_job import DIFFUSE, LOBE, SCRATCH, ClusterJob, ClusterWorker, as_cell
-from relightcli.stages.light_factors import factor_size, put_factors
+from relightcli.stages.light_factors import put_factors, shining
 from relightcli.stages.lighting import SHINY, LightingStore, need_still
 from relightcli.stages.outputs import resolve_camera
 
@@ -98,7 +98,7 @@ def cluster_lights(config: Config) -> dict[str, Any]:
     }
     if config.dry_run:
         told = {"dry_run": True, "receivers": len(lighting), "resolution": config.resolution, "notes": []}
-        return {**told, **factor_size(lighting)} if config.light_factors else told
+        return {**told, "shining_receivers": shining(lighting)} if config.light_factors else told
     writer = formats.begin(
         config.output,
         KIND,
@@ -128,7 +128,7 @@ def cluster_lights(config: Config) -> dict[str, Any]:
             base.flush()
         if config.light_factors:
             with account.step("factors"):
-                put_factors(writer, lighting, config.workers)
+                put_factors(writer, lighting)
         shadows = "shadows" in lighting.store.settings["effects"]
         job = ClusterJob(
             str(writer.partial_path), config.resolution, epsilon, config.criterion, shadows, view is not None

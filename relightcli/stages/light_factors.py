@@ -1,9 +1,10 @@
 """Specular light of clustered stores for many views: light of the factors of BRDFs, made once for every map.
 
-written by cluster    models of the families in the scene, and the visible shares of their lobes
-a new map             light of the factors from the clusters (`core.shade.factor_sum`), skies for the lobes
-a new view, other     one product per receiver with the view factors, lobes, and highlights of the points, for
-materials             which rays have told who sees them [Sun 2007, Eq. 3-4]
+written by cluster    models of the families in the scene, without lobes of their own
+a new map             light of the factors from the clusters (`core.shade.factor_sum`), prefiltered skies
+a new view, other     broad lobes as one product per receiver with the view factors, narrow ones from a few
+materials             directions (`core.shade.sampled_lobes`); highlights of the map's points, for which rays have
+                      told who sees them, and of the brightest texels [Sun 2007, Eq. 3-4]
 """
 
 from __future__ import annotations
@@ -14,17 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 import relight_formats as formats
-from relightcli.core.brdf.direct_model import DEGREES, FAMILIES, light_factors
+from relightcli.core.brdf.direct_model import FAMILIES, light_factors
 from relightcli.core.brdf.models import SPECULAR, MaterialTable, widen
 from relightcli.core.lights import quadtree
 from relightcli.core.lights.environment import latlong_to_cube, splat
 from relightcli.core.lights.leaf_light import LeafLight, Splitter
+from relightcli.core.lights.points import Points
 from relightcli.core.lights.quadtree import Cell
+from relightcli.core.shade.bright import Bright, split_bright
 from relightcli.core.shade.factor_sum import add_points, factor_light
+from relightcli.core.shade.sampled_lobes import make_skies
 from relightcli.core.shade.seen_points import point_irradiance, point_lobes
-from relightcli.core.transport.lobe_visibility import lobe_visibility, table_side
-from relightcli.run.accounting import Meter
-from relightcli.stages.family import BLOCK, Family, families_of, lobe_arrays, put_model, put_receivers
+from relightcli.stages.brdf_data import broad_model
+from relightcli.stages.family import BROAD, Family, families_of, put_family
 from relightcli.stages.light_cluster_job import as_cell
 from relightcli.stages.lighting import LightingStore
 
@@ -35,29 +38,15 @@ PLACE = "light_factors"
 GROUPS = 8  # along a face: groups of clusters for which a factor is looked up once
 
 
-def put_factors(writer: formats.Writer, lighting: LightingStore, threads: int) -> None:
-    """Writes what `LightFactors` reads, a block of receivers at a time."""
+def put_factors(writer: formats.Writer, lighting: LightingStore) -> None:
+    """Writes what `LightFactors` reads."""
     for name, receivers in families_of(lighting).items():
-        degrees = put_model(writer, PLACE, name).degrees.tolist()
-        put_receivers(writer, PLACE, name, receivers)
-        lobes = lobe_arrays(writer, PLACE, name, len(receivers), degrees)
-        for start in range(0, len(receivers), BLOCK):
-            block = f"{PLACE}/{name}-{start}"
-            if block in writer.done:
-                continue
-            meter = Meter()
-            own = receivers[start : start + BLOCK]
-            tables = lobe_visibility(lighting.bits_of(own), lighting.normal[own], degrees, threads)
-            for target, table in zip(lobes, tables, strict=True):
-                target[start : start + len(own)] = table
-            writer.record(block, {**meter.read(), "receivers": len(own)})
+        put_family(writer, PLACE, name, broad_model(name, BROAD[0]), receivers)
 
 
-def factor_size(lighting: LightingStore) -> dict[str, int]:
-    """What `put_factors` will write of the receivers: how many they are, and bytes before compression."""
-    nodes = sum(table_side(d) ** 2 for d in DEGREES if d > 0.0)
-    count = sum(len(receivers) for receivers in families_of(lighting).values())
-    return {"shining_receivers": count, "factor_raw_bytes": count * (nodes + 4)}
+def shining(lighting: LightingStore) -> int:
+    """How many receivers have factors."""
+    return sum(len(receivers) for receivers in families_of(lighting).values())
 
 
 class LightFactors:
@@ -72,6 +61,7 @@ class LightFactors:
         self._lit: LeafLight | None = None
         self._given: MaterialTable | None = None
         self._wide: MaterialTable
+        self.bright: Bright
         self._known: NDArray[np.bool_]
 
     def specular(
@@ -93,7 +83,7 @@ class LightFactors:
                 self._known[family.receiver] = table.model[material[family.receiver]] == family.code
         out, threads = np.zeros((len(self.lighting), 3), np.float32), self.lighting.threads
         for family in self.families:
-            out[family.receiver] = family.specular(table, self._wide, None, view, active, threads)
+            out[family.receiver] = family.specular(table, self._wide, self.bright, view, active, threads)
         points = self.sky.points
         if len(points.flux) and self.families:
             rows = np.flatnonzero(self._known if active is None else self._known & active)
@@ -106,29 +96,36 @@ class LightFactors:
         return out, self._known
 
     def _set_light(self) -> None:
+        """Light of the factors from what is neither a point nor one of the brightest texels; and skies of that."""
         if self.parts is None:
             return
         sky, lighting, threads = self.sky, self.lighting, self.lighting.threads
         rest, rotate = sky.rest
-        cells = splat(latlong_to_cube(rest, lighting.resolution, rotate))
+        cells, self.bright = split_bright(splat(latlong_to_cube(rest, lighting.resolution, rotate)))
         parts, seen = self.parts, sky.seen(sky.parts)
         light = parts.light(sky)
+        skies = make_skies(cells, threads)
         even = (sky.irradiance + point_irradiance(seen, sky.parts, lighting.normal, threads)) / np.pi
+        taken = Points(self.bright.direction, -self.bright.flux)
         for family, table in zip(self.families, self.tables, strict=True):
-            family.set_sky(cells, threads)
+            assert family.narrow is not None
+            family.narrow.skies = skies
             found = factor_light(
-                sky.fractions,
-                family.receiver,
-                light,
-                self.parts.cell,
-                self.parts.radius,
-                self.parts.start,
-                table,
-                threads,
+                sky.fractions, family.receiver, light, parts.cell, parts.radius, parts.start, table, threads
             )
             add_points(found, seen, sky.parts, lighting.normal, family.receiver, table, threads)
+            own, every = _open_texels(family.bits, self.bright.texel), np.arange(len(family.receiver))
+            add_points(found, own, taken, family.normal, every, table, threads)
             family.incident[:, :-1] = found
-            family.incident[:, -1] = even[family.receiver]
+            even_less = point_irradiance(own, taken, family.normal, threads) / np.pi
+            family.incident[:, -1] = even[family.receiver] + even_less
+
+
+def _open_texels(bits: NDArray[np.uint8], texel: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which of n receivers see some texels (K,): (K, n)."""
+    words = bits.reshape(len(bits), -1)
+    found: NDArray[np.bool_] = (words[:, texel >> 3] >> (texel & 7).astype(np.uint8)) & 1 == 1
+    return np.ascontiguousarray(found.T)
 
 
 class _Parts:

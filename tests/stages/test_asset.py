@@ -14,7 +14,7 @@ from relightcli.core.measure.errors import relative_rmse
 from relightcli.core.transport.channels import coefficients
 from relightcli.errors import InputError, StoreError
 from relightcli.scene.model import Camera
-from relightcli.stages import cluster, factorize, family
+from relightcli.stages import cluster, direct_tensors, factorize
 from relightcli.stages.lighting import LightingStore
 from relightcli.stages.relight import Config, relight
 from relightcli.stages.transfer_setup import TransferSetup, coarse_cells
@@ -208,7 +208,7 @@ def test_ranks_of_the_brdf_tensors_are_asked_of_the_models(clusters, tmp_path, m
         asked.append((name, ranks))
         raise InterruptedError  # to make one takes long
 
-    monkeypatch.setattr(family, "direct_model", known)
+    monkeypatch.setattr(direct_tensors, "direct_model", known)
     config = factorize.Config(clusters, tmp_path / "low.zarr", brdf_ranks=(4, 8, 8), quiet=True, workers=2)
     with pytest.raises(InterruptedError):
         factorize.factorize(config)
