@@ -26,33 +26,37 @@ from relightcli.core.shade.lobe_factors import axes_of
 
 COUNT = 28  # directions
 DEGREES = (0.0, 4.5, 8.0, 15.0, 27.0, 48.0)  # of the skies: three standard deviations; 0 is a texel
-SIDES = (4, 8, 16)  # of the squares of texels whose means are kept
+SIDES = (4, 8, 16)  # of the squares of texels whose means are kept; each of four of the one before
 POLAR = 64  # samples of the albedo over cos(theta_o), from 0 to 1
+# Standard deviation of a sky over the radius of the disc of a direction's solid angle. That of the disc itself is 0.5;
+# wider ones overlap, so that what a small light gives does not hang on where it lies between the directions.
+SPREAD = 0.7
+STEPS = 16  # of v.h, over which the solid angle of a direction changes
 _FAST = {"reassoc", "contract", "nsz"}
 
 
 class Skies(NamedTuple):
     """Prefiltered skies one after another: value (T, 4) float32, as of `prefiltered_sky`; first (L,) int64, where each
-    begins; nodes (L,) int64, less one, along a face; most (L,) float32: the solid angle up to which each is taken."""
+    begins; nodes (L,) int64, less one, along a face; most (L - 1,): the solid angle up to which each but the last is
+    taken."""
 
     value: NDArray[np.float32]
     first: NDArray[np.int64]
     nodes: NDArray[np.int64]
-    most: NDArray[np.float32]
+    most: NDArray[np.float64]
 
 
 class Shares(NamedTuple):
     """Visible shares of n receivers: words (n, 6 R R / 8) uint8, their bits; mean (n, P) uint8, shares of squares times
-    255; first (Q,) int64, where those of each size begin; count (Q,) int64, squares along a face; most (Q,) float32:
-    the solid angle up to which each size is taken, and before them the single texels, whose is `texel`."""
+    255; first (Q,) int64, where those of each size begin; count (Q,) int64, squares along a face; most (Q,): the solid
+    angle from which each size is taken, below the first the bits."""
 
     words: NDArray[np.uint8]
     resolution: int
     mean: NDArray[np.uint8]
     first: NDArray[np.int64]
     count: NDArray[np.int64]
-    most: NDArray[np.float32]
-    texel: float
+    most: NDArray[np.float64]
 
 
 class Lobe(NamedTuple):
@@ -95,9 +99,7 @@ def make_skies(sky: SkyCube, threads: int = 1) -> Skies:
     first = np.concatenate([[0], np.cumsum(6 * (nodes + 1) ** 2)[:-1]])
     sigma = np.radians(np.array(DEGREES)) / 3.0
     sigma[0] = math.sqrt(4.0 * math.pi / 6.0) / sky.resolution / math.sqrt(12.0)
-    # A disc has a quarter of its radius squared for the variance along an axis.
-    between = np.sqrt(sigma[:-1] * sigma[1:])
-    most = np.append(4.0 * math.pi * between**2, np.inf).astype(np.float32)
+    most = math.pi * sigma[:-1] * sigma[1:] / SPREAD**2
     return Skies(np.concatenate([level.reshape(-1, 4) for level in found]), first, nodes, most)
 
 
@@ -110,11 +112,8 @@ def make_shares(bits: NDArray[np.uint8], threads: int = 1) -> Shares:
     first = np.concatenate([[0], np.cumsum(6 * count**2)]).astype(np.int64)
     mean = np.zeros((len(bits), first[-1]), np.uint8)
     in_parts(lambda a, b: _means(words[a:b], resolution, count, first, mean[a:b]), len(bits), threads)
-    texel = 4.0 * math.pi / (6.0 * resolution**2)
-    # Bilinear look-up is about twice as wide as a square.
-    areas = texel * np.array([1.0, *[side * side for side in sides]]) * 2.0
-    most = np.append(np.sqrt(areas[:-1] * areas[1:]), np.inf)
-    return Shares(words, resolution, mean, first[:-1], count, most[1:].astype(np.float32), float(most[0]))
+    areas = 4.0 * math.pi / (6.0 * resolution**2) * np.array([1.0, *[side * side for side in sides]])
+    return Shares(words, resolution, mean, first[:-1], count, np.sqrt(areas[:-1] * areas[1:]))
 
 
 def sample_lobes(
@@ -132,54 +131,51 @@ def sample_lobes(
 
     views, normals (n, 3) float32 unit; rows (M,): receivers that have the material.
     """
-    weight = np.asarray(colour, np.float32)
-    fresnel = np.float32(lobe.fresnel)
+    weight, fresnel = np.asarray(colour, np.float32), np.float32(lobe.fresnel)
+    angle = lobe.size[:, None] * (np.arange(STEPS + 1) + 0.5) / STEPS
+    levels = np.stack([np.searchsorted(shares.most, angle) - 1, np.searchsorted(skies.most, angle)], -1).astype(
+        np.int64
+    )
 
     def some(a: int, b: int) -> None:
         _sample(
-            *shares[:-1],
-            np.float32(shares.texel),
-            *skies,
-            views,
-            normals,
-            rows[a:b],
-            lobe.half,
-            lobe.size,
-            lobe.albedo,
-            fresnel,
-            weight,
-            out,
-        )
+            shares.words, shares.resolution, shares.mean, shares.first, shares.count, skies.value, skies.first,
+            skies.nodes, views, normals, rows[a:b], lobe.half, levels, lobe.albedo, fresnel, weight, out,
+        )  # fmt: skip
 
     in_parts(some, len(rows), threads)
 
 
 @njit(cache=True, nogil=True)
 def _means(words, resolution, count, first, mean):  # type: ignore[no-untyped-def]
+    ones = np.zeros(16, np.int64)
+    for value in range(1, 16):
+        ones[value] = ones[value >> 1] + (value & 1)
+    finest, row = resolution // SIDES[0], resolution // 8  # bytes of a row
+    seen = np.empty((6, finest, finest), np.int64)
     for i in range(len(words)):
+        seen[:] = 0
+        for line in range(6 * resolution):
+            face, r = line // resolution, line % resolution // SIDES[0]
+            for k in range(row):
+                byte = words[i, line * row + k]
+                seen[face, r, 2 * k] += ones[byte & 15]
+                seen[face, r, 2 * k + 1] += ones[byte >> 4]
+        n = finest
         for q in range(len(count)):
-            n = count[q]
-            side = resolution // n
+            if q:
+                n //= 2
+                for face in range(6):
+                    for r in range(n):
+                        for c in range(n):
+                            upper = seen[face, 2 * r, 2 * c] + seen[face, 2 * r, 2 * c + 1]
+                            lower = seen[face, 2 * r + 1, 2 * c] + seen[face, 2 * r + 1, 2 * c + 1]
+                            seen[face, r, c] = upper + lower
+            area = (resolution // n) ** 2
             for face in range(6):
                 for r in range(n):
                     for c in range(n):
-                        seen = 0
-                        for y in range(r * side, (r + 1) * side):
-                            for x in range(c * side, (c + 1) * side):
-                                t = (face * resolution + y) * resolution + x
-                                seen += (words[i, t >> 3] >> np.uint8(t & 7)) & np.uint8(1)
-                        mean[i, first[q] + (face * n + r) * n + c] = (255 * seen + side * side // 2) // (side * side)
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
-def _place(u, v, n):  # type: ignore[no-untyped-def]
-    """Row and column of the first of 2 x 2 squares about a place of a face that has n along a side, and parts."""
-    one, half, zero = np.float32(1.0), np.float32(0.5), np.float32(0.0)
-    top = np.float32(n) - np.float32(1.001)
-    b = max(min((v + one) * half * np.float32(n) - half, top), zero)
-    c = max(min((u + one) * half * np.float32(n) - half, top), zero)
-    g, h = int(b), int(c)
-    return g, h, b - np.float32(g), c - np.float32(h)
+                        mean[i, first[q] + (face * n + r) * n + c] = (255 * seen[face, r, c] + area // 2) // area
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
@@ -188,25 +184,19 @@ def _open(words, i, t):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
-def _share(words, resolution, mean, first, count, most, texel, i, face, u, v, angle):  # type: ignore[no-untyped-def]
-    one = np.float32(1.0)
-    if len(count) == 0 or angle <= texel:
-        g, h, b, c = _place(u, v, resolution)
-        t = (face * resolution + g) * resolution + h
-        low = (one - c) * _open(words, i, t) + c * _open(words, i, t + 1)
-        t += resolution
-        high = (one - c) * _open(words, i, t) + c * _open(words, i, t + 1)
-        return low + b * (high - low)
-    q = 0
-    while q < len(count) - 1 and angle > most[q]:
-        q += 1
-    n = count[q]
-    g, h, b, c = _place(u, v, n)
-    t = first[q] + (face * n + g) * n + h
-    low = (one - c) * np.float32(mean[i, t]) + c * np.float32(mean[i, t + 1])
-    t += n
-    high = (one - c) * np.float32(mean[i, t]) + c * np.float32(mean[i, t + 1])
-    return (low + b * (high - low)) * np.float32(1.0 / 255.0)
+def _between_texels(words, i, resolution, face, u, v):  # type: ignore[no-untyped-def]
+    """Visibility at a place of a face, bilinear between the texels' centres."""
+    one, half, zero = np.float32(1.0), np.float32(0.5), np.float32(0.0)
+    top = np.float32(resolution) - np.float32(1.001)
+    b = max(min((v + one) * half * np.float32(resolution) - half, top), zero)
+    c = max(min((u + one) * half * np.float32(resolution) - half, top), zero)
+    g, h = int(b), int(c)
+    b, c = b - np.float32(g), c - np.float32(h)
+    t = (face * resolution + g) * resolution + h
+    low = (one - c) * _open(words, i, t) + c * _open(words, i, t + 1)
+    t += resolution
+    high = (one - c) * _open(words, i, t) + c * _open(words, i, t + 1)
+    return low + b * (high - low)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
@@ -216,24 +206,21 @@ def _sample(  # type: ignore[no-untyped-def]
     mean,
     mean_first,
     mean_count,
-    mean_most,
-    texel,
     sky,
     sky_first,
     sky_nodes,
-    sky_most,
     views,
     normals,
     rows,
     half,
-    size,
+    levels,
     albedo,
     fresnel,
     colour,
     out,
 ):
     zero, one, two, middle = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(0.5)
-    polar = np.float32(len(albedo) - 1)
+    polar, steps = np.float32(len(albedo) - 1), np.float32(levels.shape[1] - 1)
     for i in rows:
         s, t, n = axes_of((normals[i, 0], normals[i, 1], normals[i, 2]))
         x = np.float32(s[0] * views[i, 0] + s[1] * views[i, 1] + s[2] * views[i, 2])
@@ -273,27 +260,26 @@ def _sample(  # type: ignore[no-untyped-def]
             face, u, v = place_on_cube(
                 lx * p0 + ly * q0 + lz * n[0], lx * p1 + ly * q1 + lz * n[1], lx * p2 + ly * q2 + lz * n[2]
             )
-            angle = size[j] * vh
-            seen = weight * _share(
-                words, resolution, mean, mean_first, mean_count, mean_most, texel, i, face, u, v, angle
-            )
+            step = int(min(vh, one) * steps)
+            level = levels[j, step, 0]
+            if level < 0:
+                seen = weight * _between_texels(words, i, resolution, face, u, v)
+            else:
+                n_squares = mean_count[level]
+                r = min(int((v + one) * middle * np.float32(n_squares)), n_squares - 1)
+                c = min(int((u + one) * middle * np.float32(n_squares)), n_squares - 1)
+                seen = weight * np.float32(mean[i, mean_first[level] + (face * n_squares + r) * n_squares + c])
+                seen *= np.float32(1.0 / 255.0)
             if not seen > zero:
                 continue
-            k = 0
-            while angle > sky_most[k]:
-                k += 1
-            nodes = np.float32(sky_nodes[k])
-            b = max(min((v + one) * middle * nodes, nodes - np.float32(1e-3)), zero)
-            c = max(min((u + one) * middle * nodes, nodes - np.float32(1e-3)), zero)
-            g, h = int(b), int(c)
-            b, c = b - np.float32(g), c - np.float32(h)
-            m = sky_first[k] + (face * (sky_nodes[k] + 1) + g) * (sky_nodes[k] + 1) + h
-            e0, e1, e2, e3 = sky[m], sky[m + 1], sky[m + sky_nodes[k] + 1], sky[m + sky_nodes[k] + 2]
-            w0, w1 = seen * (one - b) * (one - c), seen * (one - b) * c
-            w2, w3 = seen * b * (one - c), seen * b * c
-            red += w0 * e0[0] + w1 * e1[0] + w2 * e2[0] + w3 * e3[0]
-            green += w0 * e0[1] + w1 * e1[1] + w2 * e2[1] + w3 * e3[1]
-            blue += w0 * e0[2] + w1 * e1[2] + w2 * e2[2] + w3 * e3[2]
+            level = levels[j, step, 1]
+            nodes = sky_nodes[level]
+            r = int((v + one) * middle * np.float32(nodes) + middle)
+            c = int((u + one) * middle * np.float32(nodes) + middle)
+            light = sky[sky_first[level] + (face * (nodes + 1) + r) * (nodes + 1) + c]
+            red += seen * light[0]
+            green += seen * light[1]
+            blue += seen * light[2]
         if not total > zero:
             continue
         at = min(z, np.float32(0.99999)) * polar
