@@ -25,7 +25,7 @@ from relightcli.core.brdf.models import SPECULAR, MaterialTable, widen
 from relightcli.core.lights.bright_cells import bright_cells, cut
 from relightcli.core.lights.environment import latlong_to_cube
 from relightcli.core.lights.leaf_light import LeafLight, Splitter
-from relightcli.core.lights.points import Points, split_points
+from relightcli.core.lights.points import Points, both, split_points
 from relightcli.core.lights.quadtree import Tree, build_tree, first_leaves, leaves_at, solid_angles
 from relightcli.core.shade.cluster_sum import Fractions, Lobes
 from relightcli.core.shade.seen_points import point_irradiance, point_lobes
@@ -427,10 +427,6 @@ class _BakedLobes:
             )
             self._apart = (points, more)
         return self.lobes.put(self._even, self._apart[1], self.rows, len(lighting))
-
-
-def both(one: Points, other: Points) -> Points:
-    return Points(*(np.concatenate(pair) for pair in zip(one, other, strict=True)))
 
 
 def same(one: Sequence[NDArray[Any]], other: Sequence[NDArray[Any]]) -> bool:

@@ -20,10 +20,10 @@ from relightcli.core.brdf.models import SPECULAR, MaterialTable, widen
 from relightcli.core.lights import quadtree
 from relightcli.core.lights.environment import latlong_to_cube, splat
 from relightcli.core.lights.leaf_light import LeafLight, Splitter
-from relightcli.core.lights.points import Points
+from relightcli.core.lights.points import Points, both
 from relightcli.core.lights.quadtree import Cell
 from relightcli.core.shade.bright import Bright, split_bright
-from relightcli.core.shade.factor_sum import add_points, factor_light
+from relightcli.core.shade.factor_sum import factor_light
 from relightcli.core.shade.sampled_lobes import make_skies
 from relightcli.core.shade.seen_points import point_irradiance, point_lobes
 from relightcli.stages.brdf_data import broad_model
@@ -102,23 +102,22 @@ class LightFactors:
         sky, lighting, threads = self.sky, self.lighting, self.lighting.threads
         rest, rotate = sky.rest
         cells, self.bright = split_bright(splat(latlong_to_cube(rest, lighting.resolution, rotate)))
-        parts, seen = self.parts, sky.seen(sky.parts)
-        light = parts.light(sky)
-        skies = make_skies(cells, threads)
-        even = (sky.irradiance + point_irradiance(seen, sky.parts, lighting.normal, threads)) / np.pi
         taken = Points(self.bright.direction, -self.bright.flux)
+        points = both(sky.parts, taken)
+        seen = np.zeros((len(points.flux), len(lighting)), bool)
+        seen[: len(sky.parts.flux)] = sky.seen(sky.parts)
+        for family in self.families:
+            seen[len(sky.parts.flux) :, family.receiver] = _open_texels(family.bits, self.bright.texel)
+        even = (sky.irradiance + point_irradiance(seen, points, lighting.normal, threads)) / np.pi
+        parts, light, skies = self.parts, self.parts.light(sky), make_skies(cells, threads)
         for family, table in zip(self.families, self.tables, strict=True):
             assert family.narrow is not None
             family.narrow.skies = skies
-            found = factor_light(
-                sky.fractions, family.receiver, light, parts.cell, parts.radius, parts.start, table, threads
-            )
-            add_points(found, seen, sky.parts, lighting.normal, family.receiver, table, threads)
-            own, every = _open_texels(family.bits, self.bright.texel), np.arange(len(family.receiver))
-            add_points(found, own, taken, family.normal, every, table, threads)
-            family.incident[:, :-1] = found
-            even_less = point_irradiance(own, taken, family.normal, threads) / np.pi
-            family.incident[:, -1] = even[family.receiver] + even_less
+            family.incident[:, :-1] = factor_light(
+                sky.fractions, family.receiver, light, parts.cell, parts.radius, parts.start, seen, points, table,
+                threads,
+            )  # fmt: skip
+            family.incident[:, -1] = even[family.receiver]
 
 
 def _open_texels(bits: NDArray[np.uint8], texel: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -8,8 +8,10 @@ r_c half the side of a cluster, g(x, r) its cosine about the horizon (`transport
 and known: where it is linear over a group the sum is as good as one over the clusters, and U is taken once for all of
 them. So light of any map becomes light of the factors without transfer being stored for them.
 
-A cluster that is larger than a group is in parts, which have its fractions. Directions are those of all colours
-together. Nothing is added to what was there before: sums are float64 within a group, float32 over the groups.
+U is bilinear between the cells of the disc; so E is first shared out over the cells at a receiver, and then multiplied
+by the factors, however many they are. A cluster that is larger than a group is in parts, which have its fractions.
+Directions are those of all colours together. Nothing is added to what was there before: sums are float64 within a
+group, float32 over the groups.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ from relightcli.core.shade.lobe_factors import axes_of
 from relightcli.core.shade.seen_points import Seen
 from relightcli.core.transport.direct_tensor import place_on_disc
 
-LANES = 8  # factors that are summed at once
+# Order of sums is free, so that loops become vector instructions.
+_FAST = {"reassoc", "contract", "nsz"}
 
 
 def factor_light(
@@ -39,17 +42,20 @@ def factor_light(
     cell: NDArray[np.int64],
     radius: NDArray[np.float64],
     start: NDArray[np.int64],
+    seen: Seen,
+    points: Points,
     table: NDArray[np.float32],
     threads: int = 1,
 ) -> NDArray[np.float32]:
     """I0 (n, K, 3) float32, radiance times sr sr^-1, at n receivers, rising indices.
 
     light: of e parts of clusters, flux (e, 3) and moment (e, 3, 3); cell (e,): the cluster of each in `fractions`;
-    radius (e,): half their sides; start (p + 1,): the parts of every group; table (D, D, K): factors over the disc, as
-    of `direct_model.LightFactors`.
+    radius (e,): half their sides; start (p + 1,): the parts of every group; points: light beside that, or to be taken
+    away from it, seen (P, N) bool, or the visible part as float32; table (D, D, K): factors over the disc, as of
+    `direct_model.LightFactors`.
     """
-    count = table.shape[2]
-    wide = widened(table)
+    side, count = table.shape[1:]
+    factors = np.ascontiguousarray(table.reshape(side * side, count).T)
     groups = len(fractions.place)
     row = np.full(groups * GROUP, -1, np.int32)
     row[receiver] = np.arange(len(receiver))
@@ -63,62 +69,74 @@ def factor_light(
     def part(a: int, b: int) -> None:
         _sum(
             used[a:b], fractions.place, fractions.mixed, fractions.normal, row, start, cell, light.flux, weight, mean,
-            radius, wide, out,
+            radius, seen, points.direction, points.flux, side, factors, out,
         )  # fmt: skip
 
     in_parts(part, len(used), threads)
     return out
 
 
-def add_points(
-    out: NDArray[np.float32],
-    seen: Seen,
-    points: Points,
-    normal: NDArray[np.float32],
-    receiver: NDArray[np.integer],
-    table: NDArray[np.float32],
-    threads: int = 1,
-) -> None:
-    """Adds to I0 (n, K, 3) of the receivers (n,) what P points give: seen (P, N) bool, or the visible part as float32;
-    normal (N, 3) float32 unit; table as in `factor_light`."""
-    wide = widened(table)
-    in_parts(
-        lambda a, b: _points(seen, points.direction, points.flux, normal, receiver[a:b], wide, out[a:b]),
-        len(receiver),
-        threads,
-    )
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _share_out(disc, side, x, y, red, green, blue):  # type: ignore[no-untyped-def]
+    """Adds a colour at a place of the disc to the four cells about it, of (3, side x side)."""
+    i, j, a, b = place_on_disc(np.float32(x), np.float32(y), side)
+    r, g, e = np.float32(red), np.float32(green), np.float32(blue)
+    w3 = a * b
+    w1, w2 = b - w3, a - w3
+    w0 = np.float32(1.0) - a - w1
+    at = i * side + j
+    below = at + side
+    disc[0, at] += w0 * r
+    disc[1, at] += w0 * g
+    disc[2, at] += w0 * e
+    disc[0, at + 1] += w1 * r
+    disc[1, at + 1] += w1 * g
+    disc[2, at + 1] += w1 * e
+    disc[0, below] += w2 * r
+    disc[1, below] += w2 * g
+    disc[2, below] += w2 * e
+    disc[0, below + 1] += w3 * r
+    disc[1, below + 1] += w3 * g
+    disc[2, below + 1] += w3 * e
 
 
-def widened(table: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The factors (D, D, K), and zeros up to a multiple of LANES."""
-    out = np.zeros((*table.shape[:2], -(-table.shape[2] // LANES) * LANES), np.float32)
-    out[..., : table.shape[2]] = table
-    return out
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+def _multiply(factors, disc, out):  # type: ignore[no-untyped-def]
+    """out (K, 3) of factors (K, C) and light (3, C)."""
+    red, green, blue = disc[0], disc[1], disc[2]
+    for k in range(len(factors)):
+        u = factors[k]
+        r = g = b = np.float32(0.0)
+        for cell in range(len(u)):
+            r += u[cell] * red[cell]
+            g += u[cell] * green[cell]
+            b += u[cell] * blue[cell]
+        out[k, 0], out[k, 1], out[k, 2] = r, g, b
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _add_factors(table, x, y, red, green, blue, into):  # type: ignore[no-untyped-def]
-    """Adds U(x, y) of all factors, times a colour, to into (3, K)."""
-    i, j, fx, fy = place_on_disc(np.float32(x), np.float32(y), table.shape[0])
-    w3 = fx * fy
-    w1, w2 = fy - w3, fx - w3
-    w0 = np.float32(1.0) - fx - w1
-    c00, c01, c10, c11 = table[i, j], table[i, j + 1], table[i + 1, j], table[i + 1, j + 1]
-    for first in range(0, table.shape[2], LANES):
-        for lane in range(LANES):
-            k = first + lane
-            u = w0 * c00[k] + w1 * c01[k] + w2 * c10[k] + w3 * c11[k]
-            into[0, k] += u * red
-            into[1, k] += u * green
-            into[2, k] += u * blue
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _sum(used, place, mixed, normal, row, start, cell, flux, weight, mean, radius, table, out):  # type: ignore[no-untyped-def]
-    count = out.shape[1]
+def _sum(  # type: ignore[no-untyped-def]
+    used,
+    place,
+    mixed,
+    normal,
+    row,
+    start,
+    cell,
+    flux,
+    weight,
+    mean,
+    radius,
+    seen,
+    direction,
+    point_flux,
+    side,
+    factors,
+    out,
+):
     sums = np.empty((6, GROUP))  # light by colour, and directions times luminance
     tangent = np.empty((2, 3, GROUP))
-    found = np.empty((GROUP, 3, table.shape[2]), np.float32)
+    disc = np.empty((GROUP, 3, side * side), np.float32)
     whole = np.empty((4, 3))  # moment by colour and of luminance, of what all 64 see
     for g in used:
         x, y, z = normal[g, 0], normal[g, 1], normal[g, 2]
@@ -126,7 +144,7 @@ def _sum(used, place, mixed, normal, row, start, cell, flux, weight, mean, radiu
             s, t, _ = axes_of((x[i], y[i], z[i]))
             tangent[0, 0, i], tangent[0, 1, i], tangent[0, 2, i] = s
             tangent[1, 0, i], tangent[1, 1, i], tangent[1, 2, i] = t
-        found[:] = np.float32(0.0)
+        disc[:] = np.float32(0.0)
         red, green, blue, dx, dy, dz = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
         for p in range(len(start) - 1):
             some, every = False, False
@@ -147,13 +165,13 @@ def _sum(used, place, mixed, normal, row, start, cell, flux, weight, mean, radiu
                     for k in range(3):
                         whole[3, k] += weight[e] * mean[e, k]
                     continue
-                seen = mixed[q]
+                part = mixed[q]
                 r, steep, w = radius[e], 0.25 / radius[e], weight[e] / 255.0
                 fr, fg, fb = flux[e, 0] / 255.0, flux[e, 1] / 255.0, flux[e, 2] / 255.0
                 for i in range(GROUP):
                     h = x[i] * a + y[i] * b + z[i] * d
                     low = max(h + r, 0.0)
-                    v = np.float64(seen[i]) * (h if h >= r else low * low * steep)
+                    v = np.float64(part[i]) * (h if h >= r else low * low * steep)
                     red[i] += fr * v
                     green[i] += fg * v
                     blue[i] += fb * v
@@ -180,40 +198,18 @@ def _sum(used, place, mixed, normal, row, start, cell, flux, weight, mean, radiu
                 v = tangent[1, 0, i] * dx[i] + tangent[1, 1, i] * dy[i] + tangent[1, 2, i] * dz[i]
                 height = max(x[i] * dx[i] + y[i] * dy[i] + z[i] * dz[i], 0.0)  # of what is below the horizon: its rim
                 scale = 1.0 / math.sqrt(max(u * u + v * v + height * height, 1e-300))
-                _add_factors(
-                    table, u * scale, v * scale, np.float32(red[i]), np.float32(green[i]), np.float32(blue[i]), found[i]
-                )
+                _share_out(disc[i], side, u * scale, v * scale, red[i], green[i], blue[i])
         for i in range(GROUP):
-            if row[g, i] >= 0:
-                for k in range(count):
-                    for c in range(3):
-                        out[row[g, i], k, c] = found[i, c, k]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _points(seen, direction, flux, normal, receiver, table, out):  # type: ignore[no-untyped-def]
-    found = np.empty((3, table.shape[2]), np.float32)
-    for j in range(len(receiver)):
-        i = receiver[j]
-        s, t, n = axes_of((np.float64(normal[i, 0]), np.float64(normal[i, 1]), np.float64(normal[i, 2])))
-        found[:] = np.float32(0.0)
-        for p in range(len(direction)):
-            if not seen[p, i]:
+            if row[g, i] < 0:
                 continue
-            x, y, z = direction[p, 0], direction[p, 1], direction[p, 2]
-            height = n[0] * x + n[1] * y + n[2] * z
-            if not height > 0.0:
-                continue
-            light = height * np.float64(seen[p, i])
-            _add_factors(
-                table,
-                s[0] * x + s[1] * y + s[2] * z,
-                t[0] * x + t[1] * y + t[2] * z,
-                np.float32(light * flux[p, 0]),
-                np.float32(light * flux[p, 1]),
-                np.float32(light * flux[p, 2]),
-                found,
-            )
-        for k in range(out.shape[1]):
-            for c in range(3):
-                out[j, k, c] += found[c, k]
+            for p in range(len(direction)):
+                if not seen[p, g * GROUP + i]:
+                    continue
+                a, b, d = direction[p, 0], direction[p, 1], direction[p, 2]
+                h = x[i] * a + y[i] * b + z[i] * d
+                if h > 0.0:
+                    u = tangent[0, 0, i] * a + tangent[0, 1, i] * b + tangent[0, 2, i] * d
+                    v = tangent[1, 0, i] * a + tangent[1, 1, i] * b + tangent[1, 2, i] * d
+                    h *= np.float64(seen[p, g * GROUP + i])
+                    _share_out(disc[i], side, u, v, h * point_flux[p, 0], h * point_flux[p, 1], h * point_flux[p, 2])
+            _multiply(factors, disc[i], out[row[g, i]])

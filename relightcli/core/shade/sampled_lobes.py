@@ -220,6 +220,7 @@ def _sample(  # type: ignore[no-untyped-def]
     out,
 ):
     zero, one, two, middle = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(0.5)
+    inverse = one / half[:, 2]
     polar, steps = np.float32(len(albedo) - 1), np.float32(levels.shape[1] - 1)
     for i in rows:
         s, t, n = axes_of((normals[i, 0], normals[i, 1], normals[i, 2]))
@@ -239,6 +240,7 @@ def _sample(  # type: ignore[no-untyped-def]
         q0 = np.float32(cosine * t[0] - sine * s[0])
         q1 = np.float32(cosine * t[1] - sine * s[1])
         q2 = np.float32(cosine * t[2] - sine * s[2])
+        steep = one / z
         total = red = green = blue = zero
         for j in range(len(half)):
             hx, hy, hz = half[j, 0], half[j, 1], half[j, 2]
@@ -254,7 +256,7 @@ def _sample(  # type: ignore[no-untyped-def]
                 f = one - min(vh, one)
                 f = fresnel + (one - fresnel) * (f * f) * (f * f) * f
                 # G (v.h) / ((n.v)(n.h)), with the divisions by n.v taken out
-                weight = f * min(vh / (z * hz), two * min(one, lz / z))
+                weight = f * min(vh * steep * inverse[j], two * min(one, lz * steep))
             total += weight
             lx, ly = two * vh * hx - radius, two * vh * hy
             face, u, v = place_on_cube(

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from relightcli.core.lights.leaf_light import LeafLight
-from relightcli.core.lights.points import Points
+from relightcli.core.lights.points import Points, both
 from relightcli.core.shade.cluster_sum import ALL, NONE, Fractions
-from relightcli.core.shade.factor_sum import add_points, factor_light
+from relightcli.core.shade.factor_sum import factor_light
 from relightcli.core.sphere import cube
 from tests.core.brdf.reflectances import random_directions
 from tests.core.transport.test_direct_tensor import disc_values, local
@@ -19,6 +19,7 @@ SIDE, N = 16, 200  # cells along a face, all alike; receivers
 DIRECTIONS = cube.texel_directions(SIDE).reshape(-1, 3)
 SOLID = np.tile(cube.solid_angles(SIDE).reshape(-1), 6)
 RADIUS = 0.5 * np.sqrt(SOLID)
+NONE_BESIDE = (np.zeros((0, N), bool), Points(np.zeros((0, 3)), np.zeros((0, 3))))
 FAMILY = np.flatnonzero(np.arange(N) % 7 != 3)
 
 
@@ -78,7 +79,7 @@ def test_cells_one_by_one_are_the_dense_sum():
     assert (every.place == NONE).any()
     cells = np.arange(len(DIRECTIONS))
     start = np.arange(len(DIRECTIONS) + 1)
-    found = factor_light(every, FAMILY, sky, cells, RADIUS, start, factors)
+    found = factor_light(every, FAMILY, sky, cells, RADIUS, start, *NONE_BESIDE, factors)
     truth = dense(sky, factors, normals()[FAMILY], fractions()[:, FAMILY])
     # Products and places on the disc in single precision: 1e-6 each, of terms that cancel a little.
     np.testing.assert_allclose(found, truth, atol=2e-5 * np.abs(truth).max())
@@ -100,7 +101,7 @@ def test_error_of_groups_falls_with_the_square_of_their_size():
     for side in (4, 2):
         order, start = group_by(side)
         moved = LeafLight(sky.flux[order], sky.moment[order])
-        found = factor_light(every, FAMILY, moved, order, RADIUS[order], start, factors)
+        found = factor_light(every, FAMILY, moved, order, RADIUS[order], start, *NONE_BESIDE, factors)
         errors.append(math.sqrt(((found - truth) ** 2).sum() / (truth**2).sum()))
     assert errors[0] < 0.06
     assert errors[0] / errors[1] > 3.0  # 4 but for the factors' kinks at the disc's cells
@@ -110,25 +111,33 @@ def test_error_of_groups_falls_with_the_square_of_their_size():
 def test_threads_and_other_receivers_change_nothing(threads):
     every, factors, sky = packed(), table(), light()
     order, start = group_by(2)
-    given = (LeafLight(sky.flux[order], sky.moment[order]), order, RADIUS[order], start, factors)
+    given = (LeafLight(sky.flux[order], sky.moment[order]), order, RADIUS[order], start, *NONE_BESIDE, factors)
     whole = factor_light(every, np.arange(N), *given, threads)
     np.testing.assert_array_equal(factor_light(every, FAMILY, *given), whole[FAMILY])
 
 
-def test_points_are_added_where_they_are_seen():
+def test_points_are_added_where_they_are_seen_and_taken_away_again():
     factors, normal = table(), normals()
     points = Points(random_directions(5, 8), np.random.default_rng(9).random((5, 3)))
     seen = np.random.default_rng(10).random((5, N)) > 0.4
-    found = np.ones((len(FAMILY), 9, 3), np.float32)
-    add_points(found, seen, points, normal, FAMILY, factors, 2)
+    dark = LeafLight(np.zeros((len(DIRECTIONS), 3)), np.zeros((len(DIRECTIONS), 3, 3)))
+    order, start = group_by(4)
+    given = (packed(), FAMILY, dark, order, RADIUS[order], start)
+    found = factor_light(*given, seen, points, factors, 2)
     inside = local(normal[FAMILY], points.direction)
     transfer = seen[:, FAMILY].T * np.maximum(inside[..., 2], 0)
-    truth = 1 + np.einsum("np,npk,pc->nkc", transfer, disc_values(factors, inside), points.flux)
-    np.testing.assert_allclose(found, truth, rtol=1e-4, atol=1e-5)
+    truth = np.einsum("np,npk,pc->nkc", transfer, disc_values(factors, inside), points.flux)
+    np.testing.assert_allclose(found, truth, atol=1e-5)
+    none = both(points, Points(points.direction, -points.flux))
+    np.testing.assert_allclose(factor_light(*given, np.concatenate([seen, seen]), none, factors), 0.0, atol=1e-6)
 
 
 def test_no_light_is_nothing():
     dark = LeafLight(np.zeros((len(DIRECTIONS), 3)), np.zeros((len(DIRECTIONS), 3, 3)))
     order, start = group_by(4)
-    assert not factor_light(packed(), FAMILY, dark, order, RADIUS[order], start, table()).any()
-    assert factor_light(packed(), FAMILY[:0], dark, order, RADIUS[order], start, table()).shape == (0, 9, 3)
+    assert not factor_light(packed(), FAMILY, dark, order, RADIUS[order], start, *NONE_BESIDE, table()).any()
+    assert factor_light(packed(), FAMILY[:0], dark, order, RADIUS[order], start, *NONE_BESIDE, table()).shape == (
+        0,
+        9,
+        3,
+    )
