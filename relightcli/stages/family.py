@@ -26,7 +26,10 @@ from relightcli.core.transport.direct_tensor import shade_direct
 from relightcli.core.transport.lobe_visibility import add_lobes
 from relightcli.stages.lighting import LightingStore
 
-BROAD = (0.35, 0.5)  # roughness from which lobes are partly, and wholly, those of the factors where others are sampled
+# Roughness from which lobes are partly, and wholly, those of the factors where narrower ones are sampled; and how much
+# later that is where f0 is 0, and reflectance high at grazing angles alone, which factors hold less well.
+BROAD = (0.4, 0.55)
+LATER, LOW_F0 = 0.35, 0.2
 BLACK = np.zeros(3, np.float32)
 
 
@@ -57,7 +60,10 @@ class NarrowLobes:
 
     def part(self, values: tuple[float, ...]) -> float:
         """How much of a material's lobe is left to them, 0 to 1."""
-        roughness = math.sqrt(2.0 / (values[0] + 2.0)) if self.name == "blinn-phong" else values[1]
+        if self.name == "blinn-phong":
+            roughness = math.sqrt(2.0 / (values[0] + 2.0))
+        else:
+            roughness = values[1] - LATER * max(1.0 - values[0] / LOW_F0, 0.0)
         low, high = BROAD
         return min(max((high - roughness) / (high - low), 0.0), 1.0)
 

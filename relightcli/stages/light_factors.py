@@ -88,7 +88,7 @@ class LightFactors:
         if len(points.flux) and self.families:
             rows = np.flatnonzero(self._known if active is None else self._known & active)
             colour = table.parameters[:, SPECULAR : SPECULAR + 3]
-            rows = rows[colour.any(axis=1)[material[rows]]]
+            rows = rows[np.any(colour[material[rows]], axis=1)]
             shine = point_lobes(
                 self.sky.seen(points), points, self.lighting.normal, view, rows, material, self._wide, threads
             )

@@ -57,9 +57,8 @@ def factor_light(
     side, count = table.shape[1:]
     factors = np.ascontiguousarray(table.reshape(side * side, count).T)
     groups = len(fractions.place)
-    row = np.full(groups * GROUP, -1, np.int32)
-    row[receiver] = np.arange(len(receiver))
-    row = row.reshape(groups, GROUP)
+    row = np.full((groups, GROUP), -1, np.int32)
+    row.reshape(-1)[receiver] = np.arange(len(receiver))
     used = np.flatnonzero((row >= 0).any(axis=1))
     total = light.flux.sum(axis=1)[:, None]
     mean = np.divide(light.moment.sum(axis=1), total, out=np.zeros((len(total), 3)), where=total != 0.0)

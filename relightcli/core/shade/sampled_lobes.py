@@ -48,14 +48,14 @@ class Skies(NamedTuple):
 
 class Shares(NamedTuple):
     """Visible shares of n receivers: words (n, 6 R R / 8) uint8, their bits; mean (n, P) uint8, shares of squares times
-    255; first (Q,) int64, where those of each size begin; count (Q,) int64, squares along a face; most (Q,): the solid
+    255; first (Q,) int64, where those of each size begin; squares (Q,) int64, those along a face; most (Q,): the solid
     angle from which each size is taken, below the first the bits."""
 
     words: NDArray[np.uint8]
     resolution: int
     mean: NDArray[np.uint8]
     first: NDArray[np.int64]
-    count: NDArray[np.int64]
+    squares: NDArray[np.int64]
     most: NDArray[np.float64]
 
 
@@ -139,7 +139,7 @@ def sample_lobes(
 
     def some(a: int, b: int) -> None:
         _sample(
-            shares.words, shares.resolution, shares.mean, shares.first, shares.count, skies.value, skies.first,
+            shares.words, shares.resolution, shares.mean, shares.first, shares.squares, skies.value, skies.first,
             skies.nodes, views, normals, rows[a:b], lobe.half, levels, lobe.albedo, fresnel, weight, out,
         )  # fmt: skip
 

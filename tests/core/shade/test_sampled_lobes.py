@@ -83,7 +83,7 @@ def test_squares_have_the_mean_of_their_texels():
     bits = caps(NORMALS[:5], 32, 5)
     shares = make_shares(bits)
     seen = np.unpackbits(bits.reshape(5, -1), axis=1, bitorder="little").reshape(5, 6, 32, 32)
-    for side, first, count in zip(SIDES, shares.first, shares.count, strict=True):
+    for side, first, count in zip(SIDES, shares.first, shares.squares, strict=True):
         assert count == 32 // side
         mean = seen.reshape(5, 6, count, side, count, side).mean((3, 5)).reshape(5, -1)
         np.testing.assert_allclose(shares.mean[:, first : first + 6 * count * count] / 255, mean, atol=0.5 / 255 + 1e-9)
