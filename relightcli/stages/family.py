@@ -7,7 +7,6 @@ cannot hold, is the business of assets (`direct_tensors`) and of clustered light
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from relightcli.core.brdf.models import SPECULAR as SPECULAR_COLUMN
 from relightcli.core.lights.environment import SkyCube
 from relightcli.core.lights.prefiltered import prefiltered_sky
 from relightcli.core.shade.bright import Bright, add_highlights
-from relightcli.core.shade.sampled_lobes import Lobe, Skies, make_lobe, make_shares, sample_lobes
+from relightcli.core.shade.sampled_lobes import Lobe, Skies, like_roughness, make_lobe, make_shares, sample_lobes
 from relightcli.core.transport.direct_tensor import shade_direct
 from relightcli.core.transport.lobe_visibility import add_lobes
 from relightcli.stages.lighting import LightingStore
@@ -60,10 +59,9 @@ class NarrowLobes:
 
     def part(self, values: tuple[float, ...]) -> float:
         """How much of a material's lobe is left to them, 0 to 1."""
-        if self.name == "blinn-phong":
-            roughness = math.sqrt(2.0 / (values[0] + 2.0))
-        else:
-            roughness = values[1] - LATER * max(1.0 - values[0] / LOW_F0, 0.0)
+        roughness = like_roughness(self.name, values)
+        if self.name == "cook-torrance":
+            roughness -= LATER * max(1.0 - values[0] / LOW_F0, 0.0)
         low, high = BROAD
         return min(max((high - roughness) / (high - low), 0.0), 1.0)
 

@@ -24,7 +24,7 @@ from relightcli.core.lights.prefiltered import place_on_cube, prefiltered_sky
 from relightcli.core.parts import in_parts
 from relightcli.core.shade.lobe_factors import axes_of
 
-COUNT = 28  # directions
+FEWEST, MOST, RISE = 16, 28, 40.0  # directions: more by RISE times the roughness
 DEGREES = (0.0, 4.5, 8.0, 15.0, 27.0, 48.0)  # of the skies: three standard deviations; 0 is a texel
 SIDES = (4, 8, 16)  # of the squares of texels whose means are kept; each of four of the one before
 POLAR = 64  # samples of the albedo over cos(theta_o), from 0 to 1
@@ -70,8 +70,14 @@ class Lobe(NamedTuple):
     fresnel: float
 
 
-def make_lobe(family: str, *values: float, count: int = COUNT) -> Lobe:
-    """make_lobe("cook-torrance", f0, roughness) or make_lobe("blinn-phong", shininess)."""
+def like_roughness(family: str, values: tuple[float, ...]) -> float:
+    """Roughness of (f0, roughness); for (shininess,) that of a Cook-Torrance lobe which is about as wide."""
+    return math.sqrt(2.0 / (values[0] + 2.0)) if family == "blinn-phong" else values[1]
+
+
+def make_lobe(family: str, *values: float, count: int | None = None) -> Lobe:
+    """make_lobe("cook-torrance", f0, roughness) or make_lobe("blinn-phong", shininess). count: of directions."""
+    count = count or min(round(FEWEST + RISE * like_roughness(family, values)), MOST)
     u = (np.arange(count) + 0.5) / count
     turn = 2.0 * math.pi * np.mod(0.5 + 0.6180339887498949 * np.arange(count), 1.0)
     if family == "blinn-phong":
