@@ -17,6 +17,7 @@ from relightcli.core.measure.errors import relative_rmse
 from relightcli.errors import InputError
 from relightcli.scene.model import Camera, Material
 from relightcli.stages.clustered import ClusteredStore
+from relightcli.stages.family import BROAD
 from relightcli.stages.light_clusters import Config, cluster_lights
 from tests.core.shade.skies import patchy_map, smooth_map
 from tests.core.transport.scenes import lambert, sphere
@@ -271,6 +272,25 @@ def test_a_scene_that_does_not_shine_has_no_factors(tmp_path):
     path, _ = make(make_store(scene, light_resolution=16, refine=1, subdivide=False), resolution=16)
     assert not [name for name in formats.open_store(path).names() if name.startswith("light_factors/")]
     picture(path, "a.exr")
+
+
+def test_the_store_holds_models_of_broad_lobes(store):
+    read = formats.open_store(store).read
+    exponents, values = (read(f"light_factors/{name}/brdf/parameters") for name in ("blinn-phong", "cook-torrance"))
+    # The entry next to where factors begin is still in.
+    assert 0.3 < values[:, 1].min() <= BROAD[0]
+    assert 2.0 / BROAD[0] ** 2 - 2.0 <= exponents.max() < 20.0
+    assert read("light_factors/cook-torrance/brdf/degrees").shape == (0,)
+
+
+@pytest.mark.slow
+def test_pixel_receivers(transfer):
+    scene = transfer.parent / "scene.toml"
+    pixels = make_store(scene, "pixels.zarr", receivers="pixels:main", light_resolution=32, refine=2)
+    path, _ = make(pixels, "pixel-factors.zarr")
+    given = {"env": "smooth", "settings": ("ball.roughness=0.2",)}
+    ours, exact = (picture(store, f"{store.stem}.exr", **given)[0] for store in (path, pixels))
+    assert relative_rmse(ours, exact) < 0.04
 
 
 def test_what_is_refused_and_predicted(transfer, tmp_path, capsys):
