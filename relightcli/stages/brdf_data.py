@@ -46,7 +46,8 @@ def direct_model(
 
 
 def broad_model(family: str, least: float) -> model.DirectModel:
-    """The model without lobes of a family's broad BRDFs, from a roughness of about `least` on; BROAD_RANKS factors."""
+    """The model without lobes of a family's broad BRDFs, from a roughness of about `least` on. BROAD_RANKS keeps
+    pairs of factors whole, as all ranks do."""
     points = model.default_points(family)
     if family == "blinn-phong":
         broad = points[:, 0] <= points[points[:, 0] >= 2.0 / least**2 - 2.0, 0].min()
@@ -62,6 +63,7 @@ def _known(
     degrees: Sequence[float],
     resolution: int,
 ) -> model.DirectModel:
+    """The model of a set, from the cache or made now."""
     settings = {
         "family": family,
         "points": points.tolist(),
