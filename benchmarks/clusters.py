@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import statistics
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,9 @@ fov = 36
 size = [640, 480]
 """
 EPSILONS = (0.16, 0.08, 0.0425, 0.03)
+ROUGHNESSES = (0.1, 0.25, 0.4, 0.5)  # of lobes that are compared with exact ones, from EYES
+EYES = ((1.6, 1.7, 3.4), (-2.5, 0.9, 1.0))
+SHINING = 40_000  # receivers that a further view is stated for
 EDITS = 20
 Sky = NDArray[np.float32]
 
@@ -110,6 +114,57 @@ def relight(store: Path, skies: list[Sky]) -> dict[str, Any]:
         "touched": statistics.median(touched[1:]),
         "radiance": radiance,
     }
+
+
+def many_views(transfer: Path, store: Path, paths: dict[str, Path], skies: list[Sky]) -> tuple[list[Row], Table]:
+    """Views of a store of light factors: seconds, bytes, and errors of the specular layer against integration from the
+    bits, relative RMS over a sample of the receivers."""
+    import relight_formats as formats
+    from relightcli.stages.clustered import ClusteredStore
+    from relightcli.stages.lighting import LightingStore
+
+    ours, exact = ClusteredStore(store, cores()), LightingStore(transfer, cores())
+    views = []
+    for eye in EYES:
+        d = np.array(eye) - ours.position
+        views.append((d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32))
+    chosen = np.zeros(len(ours), bool)
+    chosen[sample(len(ours), 1024)] = True
+    every = {m: {name: replace(v, roughness=m) for name, v in ours.scene.materials.items()} for m in ROUGHNESSES}
+
+    def shine(lighting: LightingStore, sky: Sky, roughness: float, view: Any, active: Any = None) -> Any:
+        (direct,) = lighting.exit_radiance(sky, 0.0, every[roughness], view, active)
+        return direct.specular
+
+    for m in ROUGHNESSES:  # reads, compiles
+        shine(ours, skies[0], m, views[0])
+    first, further, rows = [], [], []
+    for name, sky in zip([*paths][1:] + [*paths][:1], skies[1:] + skies[:1], strict=True):
+        clock = time.perf_counter()
+        shine(ours, sky, ROUGHNESSES[0], views[0])
+        first.append(time.perf_counter() - clock)
+        errors: list[str | int | float] = []
+        for m in ROUGHNESSES:
+            clock = time.process_time()
+            shine(ours, sky, m, views[1])
+            further.append(time.process_time() - clock)
+            pairs = [[shine(s, sky, m, view, chosen)[chosen] for s in (ours, exact)] for view in views]
+            errors.append(max(100 * relative(a, b) for a, b in pairs))
+        rows.append((name, *errors))
+    sizes = formats.open_store(store).sizes()
+    extra = sum(size.stored for array, size in sizes.items() if array.startswith("light_factors/"))
+    shining = sum(layout.shape[0] for array, layout in ours.store.layouts.items() if array.endswith("/receiver"))
+    view = statistics.median(further) * SHINING / shining
+    return [
+        at_most("light factors: first view under a new map, median", statistics.median(first), "s", 0.5),
+        at_most(f"light factors: CPU of a further view of {SHINING:,} shining receivers, median", view, "s", 0.02),
+        Row("light factors: bytes beyond the bits and the fractions", extra / 1e6, "MB"),
+        at_most("light factors: largest error of the specular layer", max(max(row[1:]) for row in rows), "%", 6),
+    ], Table(
+        "light factors: relative RMS error of the specular layer, %, the larger of two views",
+        ("sky", *(f"roughness {m:g}" for m in ROUGHNESSES)),
+        tuple(rows),
+    )
 
 
 def storage(store: Path) -> tuple[tuple[str | int | float, ...], ...]:
@@ -202,6 +257,15 @@ def measure(setting: Setting) -> Report:
         shares = [100 * relative(a, b) for a, b in zip(ours, exact, strict=True)]
         errors.append((name, *shares))
         report.rows.append(at_most(f"{name}: largest error of {len(skies)} maps", max(shares), "%", 2))
+        if glossy:
+            factors = scene.parent / "factors.zarr"
+            run_tool(
+                "cluster", transfer, "-o", factors, "--overwrite", "--light-resolution", str(resolution),
+                "--light-factors",
+            )  # fmt: skip
+            more, table = many_views(transfer, factors, paths, skies)
+            report.rows += more
+            report.tables.append(table)
         if name != "bunny":
             continue
         if not setting.quick:

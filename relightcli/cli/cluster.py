@@ -56,6 +56,12 @@ from relightcli.cli import options
 )
 @click.option("--seconds", default=None, type=float, help="Lights: refine so long; the largest error is split first.")
 @click.option("--camera", default=None, help="Lights: the view for which specular lobes are kept.")
+@click.option(
+    "--light-factors",
+    "light_factors",
+    is_flag=True,
+    help="Lights: keep what makes a new view of specular lobes a matter of milliseconds, at some percent of error.",
+)
 @click.option("--seed", default=0, type=options.SEED, show_default=True, help="Seed of samples and first centres.")
 @click.option("--dry-run", is_flag=True, help="Say what would be made and what it should cost; do nothing.")
 @options.workers
@@ -77,6 +83,8 @@ def command(
     common: dict[str, Any] = {"store": store, "output": output, "workers": workers or options.available_cores()}
     common |= {"quiet": quiet or as_json} | {name: settings[name] for name in ("seed", "dry_run", "overwrite")}
     asked: dict[str, Any] = {name: value for name, value in settings.items() if name in OF_LIGHTS and value is not None}
+    if settings["light_factors"]:
+        asked["light_factors"] = True
     from relightcli.stages.cluster import Config, cluster, direct_only
 
     if set(asked) - {"criterion"} or direct_only(store):
@@ -97,7 +105,10 @@ OF_LIGHTS = ("resolution", "epsilon", "criterion", "lights", "seconds", "camera"
 
 def _light_text(result: dict[str, Any]) -> str:
     if result.get("dry_run"):
-        return f"{result['receivers']} receivers, {6 * result['resolution'] ** 2} lights"
+        text = f"{result['receivers']} receivers, {6 * result['resolution'] ** 2} lights"
+        if "shining_receivers" in result:
+            text += f", factors for {result['shining_receivers']} receivers"
+        return text
     if result["status"] == "up to date":
         return f"{result['store']} is up to date"
     return (

@@ -15,6 +15,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 import relight_formats as formats
 from relightcli import __version__
 from relightcli.core.brdf import direct_model as model
@@ -22,6 +25,8 @@ from relightcli.core.brdf.disc import RESOLUTION
 from relightcli.errors import StoreError
 
 KIND = "brdf"
+# Where factors cost no bytes they can be many: three times those of an asset hold broad lobes without others' help.
+BROAD_RANKS = (8, 32, 24)
 
 
 def direct_model(
@@ -37,7 +42,28 @@ def direct_model(
     Cook-Torrance, in place of the family's own. Raises InputError for an unknown family.
     """
     points = model.measured_points() if measured else model.default_points(family)
-    ranks = ranks or model.RANKS.get(family)
+    return _known(family, points, ranks or model.RANKS.get(family), degrees, resolution)
+
+
+def broad_model(family: str, least: float) -> model.DirectModel:
+    """The model without lobes of a family's broad BRDFs, from a roughness of about `least` on. BROAD_RANKS keeps
+    pairs of factors whole, as all ranks do."""
+    points = model.default_points(family)
+    if family == "blinn-phong":
+        broad = points[:, 0] <= points[points[:, 0] >= 2.0 / least**2 - 2.0, 0].min()
+    else:
+        broad = points[:, 1] >= points[points[:, 1] <= least, 1].max()
+    return _known(family, points[broad], BROAD_RANKS, (), RESOLUTION)
+
+
+def _known(
+    family: str,
+    points: NDArray[np.float64],
+    ranks: tuple[int, int, int] | None,
+    degrees: Sequence[float],
+    resolution: int,
+) -> model.DirectModel:
+    """The model of a set, from the cache or made now."""
     settings = {
         "family": family,
         "points": points.tolist(),

@@ -29,6 +29,7 @@ ARRAYS = {
     "light/": "light-basis",
     "cluster/": "groups",
     "light_clusters/": "clusters",
+    "light_factors/": "factors",
     "one_bounce/": "one-bounce",
     "two_bounce/": "two-bounce",
 }

@@ -4,7 +4,8 @@ the map             small bright places become points, for which rays are traced
                     Cells that hold much of it are cut into smaller lights (`core.lights.bright_cells`)
 a new map           moments of the leaves that changed, and what they change in the irradiance [Johan and Nishita,
                     Eq. 15, with C_t for the printed C_i]
-specular lobes      as baked in for one view; their colour may change. Without a fixed view: integrated from the
+specular lobes      as baked in for one view; their colour may change. Without a fixed view: from the light of the
+                    factors of BRDFs, if the store is made for that (`light_factors`), else integrated from the
                     visibility bits of the transfer store, for every view and every lobe
 """
 
@@ -12,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numba import njit
@@ -24,7 +25,7 @@ from relightcli.core.brdf.models import SPECULAR, MaterialTable, widen
 from relightcli.core.lights.bright_cells import bright_cells, cut
 from relightcli.core.lights.environment import latlong_to_cube
 from relightcli.core.lights.leaf_light import LeafLight, Splitter
-from relightcli.core.lights.points import Points, split_points
+from relightcli.core.lights.points import Points, both, split_points
 from relightcli.core.lights.quadtree import Tree, build_tree, first_leaves, leaves_at, solid_angles
 from relightcli.core.shade.cluster_sum import Fractions, Lobes
 from relightcli.core.shade.seen_points import point_irradiance, point_lobes
@@ -32,6 +33,9 @@ from relightcli.errors import InputError, StoreError
 from relightcli.scene.model import Material
 from relightcli.stages.light_cluster_job import DIFFUSE, LOBE
 from relightcli.stages.lighting import LightingStore, Radiance, _Coats
+
+if TYPE_CHECKING:
+    from relightcli.stages.light_factors import LightFactors
 
 PARTLY = 0.25  # of the clusters: if more have changed, all are summed again
 MANY = 64  # cells that are not summed one by one
@@ -44,8 +48,9 @@ class ClusteredStore(LightingStore):
 
     def __init__(self, store: Path | formats.Store, threads: int) -> None:
         super().__init__(store, threads)
-        self._sky: _ClusteredSky | None = None
+        self._sky: ClusteredSky | None = None
         self._lobes: _BakedLobes | None = None
+        self._factors: LightFactors | None = None
         self._colour: tuple[_Coats, NDArray[np.float32]] | None = None
 
     def exit_radiance(
@@ -82,9 +87,9 @@ class ClusteredStore(LightingStore):
             writer.put("light/bright", self.sky.bright, dims=("bright",))
 
     @property
-    def sky(self) -> _ClusteredSky:
+    def sky(self) -> ClusteredSky:
         if self._sky is None:
-            self._sky = _ClusteredSky(self)
+            self._sky = ClusteredSky(self)
         return self._sky
 
     def _direct(
@@ -117,14 +122,36 @@ class ClusteredStore(LightingStore):
             )
         colour = self._colour[1]
         if self._lobes is None:
-            rows = np.flatnonzero(coats.shiny if looked_at is None else coats.shiny & looked_at)
-            cells = latlong_to_cube(environment, self.resolution, rotate)
-            specular = self._exact_specular(cells, environment, rotate, coats, view, rows)
+            specular = self._shine(environment, rotate, coats, view, looked_at)
         else:
             specular = self._lobes.shine(sky, coats, view) * colour
         if lamps is not None:
             specular += lamps * colour
         return Radiance(diffuse, specular)
+
+    def _shine(
+        self,
+        environment: NDArray[np.float32],
+        rotate: float,
+        coats: _Coats,
+        view: NDArray[np.float32],
+        looked_at: NDArray[np.bool_] | None,
+    ) -> NDArray[np.float32]:
+        """Specular light of the sky towards any view, (N, 3), of receivers that are `looked_at`, 0 of others."""
+        wanted = coats.shiny if looked_at is None else coats.shiny & looked_at
+        found = None
+        if self.store.settings.get("light_factors"):
+            if self._factors is None:
+                from relightcli.stages.light_factors import LightFactors  # what diffuse light need not wait for
+
+                self._factors = LightFactors(self, self.sky)
+            found, known = self._factors.specular(coats.table, coats.material, view, wanted)
+            wanted = wanted & ~known
+            if not wanted.any():
+                return found
+        cells = latlong_to_cube(environment, self.resolution, rotate)
+        exact = self._exact_specular(cells, environment, rotate, coats, view, np.flatnonzero(wanted))
+        return exact if found is None else found + exact
 
 
 class Runs:
@@ -170,11 +197,11 @@ class _Cut:
         return bright, self._parts
 
 
-class _ClusteredSky:
+class ClusteredSky:
     """The map in clusters, and what is summed apart from them.
 
-    points: small bright places; bright: cells with fractions that are cut, parts: what they are cut into; changed:
-    clusters whose light the last `set_light` changed, None where all were summed.
+    cells: those with fractions; points: small bright places; bright: cells that are cut, parts: what they are cut into;
+    changed: clusters whose light the last `set_light` changed, None where all were summed.
     """
 
     def __init__(self, lighting: ClusteredStore) -> None:
@@ -187,7 +214,7 @@ class _ClusteredSky:
         array: Any = lighting.store.array("light_clusters/fraction")
         step = array.chunks[1]
         columns = (np.asarray(array[:, a : a + step]) for a in range(0, array.shape[1], step))
-        own = read(f"light_clusters/{DIFFUSE}")
+        own = self.cells = read(f"light_clusters/{DIFFUSE}")
         radius = 0.5 * np.sqrt(solid_angles(own, self.tree.resolution))
         self.fractions = Fractions(columns, lighting.normal, radius)
         self.runs = Runs(self.tree, own)
@@ -250,9 +277,14 @@ class _ClusteredSky:
     def cut(self, cells: _Cut) -> tuple[NDArray[np.int64], Points]:
         """Bright ones of some cells, and what they are cut into."""
         assert self.light is not None
+        return cells.of(self.light, *self.rest)
+
+    @property
+    def rest(self) -> tuple[NDArray[np.float32], float]:
+        """The map without its points, and the degrees by which it is turned."""
         assert self._rest is not None
         assert self._given is not None
-        return cells.of(self.light, self._rest, self._given[1])
+        return self._rest, self._given[1]
 
     @property
     def irradiance(self) -> NDArray[np.float64]:
@@ -361,7 +393,7 @@ class _BakedLobes:
                 "for other changes use the transfer store it came from"
             )
 
-    def shine(self, sky: _ClusteredSky, coats: _Coats, view: NDArray[np.float32]) -> NDArray[np.float32]:
+    def shine(self, sky: ClusteredSky, coats: _Coats, view: NDArray[np.float32]) -> NDArray[np.float32]:
         """(N, 3). Raises InputError for another view, or other lobes than were baked in."""
         lighting = self.lighting
         if self._good is None or self._good[0] is not coats or self._good[1] is not view:
@@ -395,10 +427,6 @@ class _BakedLobes:
             )
             self._apart = (points, more)
         return self.lobes.put(self._even, self._apart[1], self.rows, len(lighting))
-
-
-def both(one: Points, other: Points) -> Points:
-    return Points(*(np.concatenate(pair) for pair in zip(one, other, strict=True)))
 
 
 def same(one: Sequence[NDArray[Any]], other: Sequence[NDArray[Any]]) -> bool:

@@ -12,40 +12,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 import relight_formats as formats
-from relightcli.core.brdf.direct_model import (
-    ARRAYS,
-    FAMILIES,
-    LightFactors,
-    MaterialSetting,
-    from_arrays,
-    light_factors,
-    setting,
-)
-from relightcli.core.brdf.disc import RESOLUTION
-from relightcli.core.brdf.models import F0, ROUGHNESS, SHININESS, MaterialTable, widen
-from relightcli.core.brdf.models import SPECULAR as SPECULAR_COLUMN
+from relightcli.core.brdf.direct_model import FAMILIES, LightFactors, light_factors
+from relightcli.core.brdf.models import MaterialTable, widen
 from relightcli.core.lights.environment import SkyCube
-from relightcli.core.lights.prefiltered import prefiltered_sky
-from relightcli.core.shade.bright import Bright, add_highlights, add_irradiance, split_bright
-from relightcli.core.transport.direct_tensor import direct_light, direct_transfer, light_coefficients, shade_direct
-from relightcli.core.transport.lobe_visibility import add_lobes, lobe_visibility, table_side
+from relightcli.core.shade.bright import Bright, add_irradiance, split_bright
+from relightcli.core.transport.direct_tensor import direct_light, direct_transfer, light_coefficients
+from relightcli.core.transport.lobe_visibility import lobe_visibility, table_side
 from relightcli.run.accounting import Meter
 from relightcli.stages.brdf_data import direct_model
+from relightcli.stages.family import Family, families_of, put_family
 from relightcli.stages.lighting import LightingStore
 
-MATTE = "matte"
-BLOCK = 2048
+PLACE, MATTE = "direct", "matte"
+BLOCK = 2048  # receivers
 
 
 def group_of(lighting: LightingStore) -> dict[str, NDArray[np.int64]]:
     """Receivers of every group that has any."""
-    models = np.array([m.model for m in lighting.scene.materials.values()])
-    may_shine = np.array(
-        [m.adjustable or any(c > 0.0 for c in m.specular) for m in lighting.scene.materials.values()], bool
-    )
-    material = lighting.geometry.material[lighting.object]
-    family = np.where(np.isin(models, FAMILIES) & may_shine, models, MATTE)[material]
-    return {name: np.flatnonzero(family == name) for name in (*FAMILIES, MATTE) if (family == name).any()}
+    found = families_of(lighting)
+    matte = np.ones(len(lighting.object), bool)
+    for receivers in found.values():
+        matte[receivers] = False
+    return {**found, MATTE: np.flatnonzero(matte)} if matte.any() else found
 
 
 def put_direct(
@@ -60,22 +48,18 @@ def put_direct(
         if name == MATTE:
             factors = LightFactors(np.full((2, 2, 1), 1.0 / np.pi, np.float32), np.ones(1, np.float32))
             degrees: list[float] = []
+            writer.put(f"{PLACE}/{name}/receiver", receivers.astype(np.int32), dims=(f"{name}_receiver",))
         else:
             model = direct_model(name, ranks)
-            for leaf, values in model.arrays().items():
-                writer.put(f"direct/{name}/brdf/{leaf}", values, dims=ARRAYS[leaf])
+            put_family(writer, PLACE, name, model, receivers)
             factors, degrees = light_factors(model), model.degrees.tolist()
         count, n = factors.table.shape[2], len(receivers)
         texels = 6 * lighting.resolution**2
         kept = min(keep, texels)
-        group = f"direct/{name}"
-        writer.put(f"{group}/receiver", receivers.astype(np.int32), dims=(f"{name}_receiver",))
 
-        def array(
-            leaf: str, shape: tuple[int, ...], dtype: str, dims: tuple[str, ...], group: str = group, name: str = name
-        ) -> Any:
+        def array(leaf: str, shape: tuple[int, ...], dtype: str, dims: tuple[str, ...], name: str = name) -> Any:
             return writer.array(
-                f"{group}/{leaf}",
+                f"{PLACE}/{name}/{leaf}",
                 shape=shape,
                 dtype=dtype,
                 chunks=(BLOCK, *shape[1:]),
@@ -92,7 +76,7 @@ def put_direct(
             for d in wide
         ]
         for start in range(0, n, BLOCK):
-            block = f"direct/{name}-{start}"
+            block = f"{PLACE}/{name}-{start}"
             if block in writer.done:
                 continue
             meter = Meter()
@@ -113,10 +97,10 @@ class DirectTensors:
         self.lighting = lighting
         store = lighting.store
         names = (*FAMILIES, MATTE)
-        self.groups = [_Group(lighting, name) for name in names if f"direct/{name}/receiver" in store]
+        self.groups = [_Group(lighting, name) for name in names if f"{PLACE}/{name}/receiver" in store]
         self.known = np.zeros(len(lighting), bool)  # receivers with tensors of their lobes
         for group in self.groups:
-            self.known[group.receiver] = group.name != MATTE
+            self.known[group.receiver] = group.family is not None
         self.even = np.zeros((len(lighting), 3), np.float32)
         self.bright: Bright
 
@@ -130,7 +114,9 @@ class DirectTensors:
         light = light_coefficients(rest.radiance())
         self.even = np.zeros_like(self.even)  # a new array: what was made of the old one is told by it
         for group in self.groups:
-            group.set_light(rest, light, lighting.threads)
+            group.set_light(light, lighting.threads)
+            if group.family is not None:
+                group.family.set_sky(rest, lighting.threads)
             self.even[group.receiver] = np.maximum(group.incident[:, -1], 0.0)
         if len(self.bright.texel):
             for rows, bits in lighting.blocks():
@@ -144,87 +130,22 @@ class DirectTensors:
         out = np.zeros((len(self.lighting), 3), np.float32)
         wide = widen(table, 0.5 * np.pi / self.lighting.resolution)
         for group in self.groups:
-            if group.name != MATTE:
-                out[group.receiver] = group.specular(table, wide, self.bright, view, active, self.lighting.threads)
+            if group.family is not None:
+                threads = self.lighting.threads
+                out[group.receiver] = group.family.specular(table, wide, self.bright, view, active, threads)
         return out, self.known
 
 
 class _Group:
+    """The tensors of a group, and its light; family None: matte."""
+
     def __init__(self, lighting: LightingStore, name: str) -> None:
-        self.name = name
         read: Any = lighting.store.read
-        self.receiver: NDArray[np.int32] = read(f"direct/{name}/receiver")
-        self.index, self.scale = read(f"direct/{name}/index"), read(f"direct/{name}/scale")
-        self.value = np.ascontiguousarray(read(f"direct/{name}/value").swapaxes(1, 2))
-        self.normal = np.ascontiguousarray(lighting.normal[self.receiver])
-        material = lighting.geometry.material[lighting.object[self.receiver]]
-        self.rows = {int(m): np.flatnonzero(material == m) for m in np.unique(material)}
-        self.incident = np.zeros((*self.scale.shape, 3), np.float32)
-        self.skies: tuple[NDArray[np.float32], ...] = ()
-        self._settings: dict[tuple[float, ...], MaterialSetting] = {}
-        if name != MATTE:
-            arrays = {leaf: read(f"direct/{name}/brdf/{leaf}") for leaf in ARRAYS}
-            self.model = from_arrays(name, RESOLUTION, arrays)
-            self.degrees = self.model.degrees.tolist()
-            self.bits = lighting.bits_of(self.receiver)
-            self.tables = tuple(read(f"direct/{name}/lobe_{d:g}") for d in self.degrees if d > 0.0)
-            self.out = np.empty((len(self.receiver), 3), np.float32)
+        self.receiver: NDArray[np.int32] = read(f"{PLACE}/{name}/receiver")
+        self.index, self.scale = read(f"{PLACE}/{name}/index"), read(f"{PLACE}/{name}/scale")
+        self.value = np.ascontiguousarray(read(f"{PLACE}/{name}/value").swapaxes(1, 2))
+        self.family = None if name == MATTE else Family(lighting, PLACE, name)
+        self.incident = np.zeros((*self.scale.shape, 3), np.float32) if self.family is None else self.family.incident
 
-    def set_light(self, sky: SkyCube, light: NDArray[np.float32], threads: int) -> None:
+    def set_light(self, light: NDArray[np.float32], threads: int) -> None:
         direct_light(self.index, self.scale, self.value, light, self.incident, threads)
-        if self.name != MATTE:
-            self.skies = prefiltered_sky(sky, self.degrees, threads=threads)
-
-    def specular(
-        self,
-        table: MaterialTable,
-        wide: MaterialTable,
-        bright: Bright,
-        view: NDArray[np.float32],
-        active: NDArray[np.bool_] | None,
-        threads: int,
-    ) -> NDArray[np.float32]:
-        towards = np.take(view, self.receiver, axis=0)
-        black = np.zeros(3, np.float32)
-        if active is not None:
-            self.out[:] = 0.0
-        for m, all_rows in self.rows.items():
-            rows = all_rows if active is None else all_rows[active[self.receiver[all_rows]]]
-            row = table.parameters[m]
-            colour = row[SPECULAR_COLUMN : SPECULAR_COLUMN + 3].astype(np.float32)
-            if not colour.any():
-                self.out[rows] = 0.0
-                continue
-            values = (row[SHININESS],) if self.name == "blinn-phong" else (row[F0], row[ROUGHNESS])
-            if values not in self._settings:
-                self._settings = {values: setting(self.model, *(float(v) for v in values))}
-            tables = self._settings[values]
-            shade_direct(self.incident, towards, self.normal, rows, tables.view_table, colour, black, self.out, threads)
-            add_lobes(
-                self.bits,
-                self.tables,
-                self.skies,
-                self.degrees,
-                towards,
-                self.normal,
-                rows,
-                tables.energy,
-                colour,
-                self.out,
-                threads,
-            )
-            np.maximum(self.out, 0.0, out=self.out)  # of truncation
-            if len(bright.texel):
-                add_highlights(
-                    self.bits,
-                    rows,
-                    towards,
-                    self.normal,
-                    bright,
-                    int(wide.model[m]),
-                    wide.parameters[m],
-                    colour,
-                    self.out,
-                    threads,
-                )
-        return self.out

@@ -33,6 +33,7 @@ from relightcli.run.accounting import Account, Meter
 from relightcli.stages.budget import summary
 from relightcli.stages.cluster import copy_arrays
 from relightcli.stages.light_cluster_job import DIFFUSE, LOBE, SCRATCH, ClusterJob, ClusterWorker, as_cell
+from relightcli.stages.light_factors import put_factors, shining
 from relightcli.stages.lighting import SHINY, LightingStore, need_still
 from relightcli.stages.outputs import resolve_camera
 
@@ -51,7 +52,7 @@ class Config:
     """Everything that clustering light needs to know.
 
     epsilon None: the criterion's default. lights, seconds: budgets; the cell with the largest contribution is then
-    split first. camera: fixes the view, for materials with specular lobes.
+    split first. camera: fixes the view, for materials with specular lobes. light_factors: what many views need.
     """
 
     store: Path
@@ -62,6 +63,7 @@ class Config:
     lights: int | None = None
     seconds: float | None = None
     camera: str | None = None
+    light_factors: bool = False
     seed: int = 0
     workers: int = 1
     scheduler: str | None = None
@@ -81,7 +83,7 @@ def cluster_lights(config: Config) -> dict[str, Any]:
     need_still(lighting.store)
     if lighting.store.kind != "transfer":
         raise StoreError(f"{config.store}: expected a store of kind transfer, found {lighting.store.kind}.")
-    view = _fixed_view(lighting, config.camera)
+    view = None if config.light_factors else _fixed_view(lighting, config.camera)
     settings = {
         **lighting.store.settings,
         "bounces": 0,
@@ -92,9 +94,11 @@ def cluster_lights(config: Config) -> dict[str, Any]:
         "seconds": config.seconds,
         "camera": None if view is None else view[0],
         "cluster_seed": config.seed,
+        **({"light_factors": True} if config.light_factors else {}),
     }
     if config.dry_run:
-        return {"dry_run": True, "receivers": len(lighting), "resolution": config.resolution, "notes": []}
+        told = {"dry_run": True, "receivers": len(lighting), "resolution": config.resolution, "notes": []}
+        return {**told, "shining_receivers": shining(lighting)} if config.light_factors else told
     writer = formats.begin(
         config.output,
         KIND,
@@ -122,6 +126,9 @@ def cluster_lights(config: Config) -> dict[str, Any]:
         with account.step("reading"):
             transpose_bits(lighting.blocks(), base)
             base.flush()
+        if config.light_factors:
+            with account.step("factors"):
+                put_factors(writer, lighting)
         shadows = "shadows" in lighting.store.settings["effects"]
         job = ClusterJob(
             str(writer.partial_path), config.resolution, epsilon, config.criterion, shadows, view is not None
@@ -180,6 +187,10 @@ def _check(config: Config) -> float:
         raise InputError(f"--epsilon: expected 0 or more; found {epsilon}")
     if config.lights is not None and config.lights < 6:
         raise InputError(f"--lights: expected 6 or more, one a face; found {config.lights}")
+    if config.light_factors and config.camera is not None:
+        raise InputError(
+            f"--light-factors: is for every view, and --camera {config.camera} keeps lobes of one; give one of the two"
+        )
     if config.seconds is not None and not config.seconds > 0.0:
         raise InputError(f"--seconds: expected more than 0; found {config.seconds}")
     return epsilon

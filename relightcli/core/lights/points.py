@@ -31,6 +31,11 @@ class Points(NamedTuple):
     flux: NDArray[np.float64]
 
 
+def both(one: Points, other: Points) -> Points:
+    """Those of one, then those of the other."""
+    return Points(*(np.concatenate(pair) for pair in zip(one, other, strict=True)))
+
+
 def split_points(
     radiance: NDArray[np.float32], rotate_degrees: float = 0.0
 ) -> tuple[NDArray[np.float32], Points, NDArray[np.int64]]:

@@ -7,13 +7,14 @@ Where that is hardly anything, as under clouds, nothing is taken out.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from relightcli.core.brdf.models import dot, lobes_and_density
+from relightcli.core.brdf.models import BLINN_PHONG, COOK_TORRANCE, ROUGHNESS, SHININESS, dot, lobes_and_density
 from relightcli.core.lights.environment import SkyCube
 from relightcli.core.lights.latlong import LUMINANCE
 from relightcli.core.parts import in_parts
@@ -22,6 +23,8 @@ from relightcli.core.sphere import cube
 COUNT = 24
 # Less than this part of the sky's flux is not worth the time.
 LEAST = 0.01
+# Exponent beyond which a lobe is passed over: it is below 4e-11 of its peak.
+NEGLIGIBLE = 24.0
 
 
 class Bright(NamedTuple):
@@ -91,9 +94,15 @@ def add_highlights(
     """
     words = bits.reshape(len(bits), -1)
     flux = bright.flux * colour
+    if model == COOK_TORRANCE:
+        least = 1.0 / (1.0 + NEGLIGIBLE * parameters[ROUGHNESS] ** 2)
+    else:
+        least = math.exp(-2.0 * NEGLIGIBLE / max(parameters[SHININESS], 1e-3)) if model == BLINN_PHONG else 0.0
 
     def part(a: int, b: int) -> None:
-        _add_highlights(words, rows[a:b], views, normals, bright.texel, bright.direction, flux, model, parameters, out)
+        _add_highlights(
+            words, rows[a:b], views, normals, bright.texel, bright.direction, flux, model, parameters, least, out
+        )
 
     in_parts(part, len(rows), threads)
 
@@ -110,11 +119,12 @@ def _add_irradiance(words, normals, texel, moment, even):  # type: ignore[no-unt
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_highlights(words, rows, views, normals, texel, direction, flux, model, parameters, out):  # type: ignore[no-untyped-def]
+def _add_highlights(words, rows, views, normals, texel, direction, flux, model, parameters, least, out):  # type: ignore[no-untyped-def]
     for i in rows:
         n = (np.float64(normals[i, 0]), np.float64(normals[i, 1]), np.float64(normals[i, 2]))
         v = (np.float64(views[i, 0]), np.float64(views[i, 1]), np.float64(views[i, 2]))
-        if not dot(n, v) > 0.0:
+        nv = dot(n, v)
+        if not nv > 0.0:
             continue
         red = green = blue = 0.0
         for k in range(len(texel)):
@@ -122,7 +132,9 @@ def _add_highlights(words, rows, views, normals, texel, direction, flux, model, 
             if not (words[i, t >> 3] >> np.uint8(t & 7)) & np.uint8(1):
                 continue
             l = (direction[k, 0], direction[k, 1], direction[k, 2])  # noqa: E741
-            if dot(n, l) > 0.0:
+            nl = dot(n, l)
+            # (n.h)^2 = (n.l + n.v)^2 / |l + v|^2
+            if nl > 0.0 and (nl + nv) * (nl + nv) >= least * 2.0 * (1.0 + dot(l, v)):
                 _, s, _, _ = lobes_and_density(model, parameters, n, l, v)
                 red += s * flux[k, 0]
                 green += s * flux[k, 1]
