@@ -108,7 +108,7 @@ def _light_text(result: dict[str, Any]) -> str:
         return f"{result['store']} is up to date"
     measured = ""
     if "measured_error" in result:
-        measured = f" ({result['measured_error']:.1%} of the radiance under a light from anywhere)"
+        measured = f" ({result['measured_error']:.1%} of the radiance under soft lights from anywhere)"
     return (
         f"{result['store']}: {result['lights']} lights in {result['light_clusters']} clusters, RMS error "
         f"{result['error']:.4f} of a light overhead{measured}, {result['rays'] / 1e6:.1f} million rays, "

@@ -170,7 +170,7 @@ def _errors(store: formats.Store, found: dict[str, Row]) -> Iterator[tuple[str, 
     if store.kind == "light_clusters" and "promise" in found:
         yield (
             "check",
-            "of radiance under a light from anywhere",
+            "of radiance under soft lights from anywhere",
             next(block["share"] for block in store.blocks if block["id"] == "promise"),
         )
     if store.kind == "pose" and "measured_error" in store.attrs:

@@ -89,7 +89,7 @@ def cluster_lights(config: Config) -> dict[str, Any]:
     view = _fixed_view(lighting, config.camera)
     left = need_tolerance(lighting.store, config.tolerance, config.criterion)
     if left is not None and config.epsilon is None:
-        epsilon = epsilon_for(left)
+        epsilon = epsilon_for(left, view is not None)
     settings = {
         **lighting.store.settings,
         "bounces": 0,
