@@ -335,7 +335,8 @@ def _sample(tree: _Grown, worker: ClusterWorker, n: int) -> NDArray[np.int32]:
 
 def _from(tree: _Grown, worker: ClusterWorker, n: int, path: tuple[int, ...]) -> list[Cell]:
     """NEIGHBOURS leaves from a cell on, in the order of the trees."""
-    job, out, stack = worker.job, [], quadtree.roots(worker.job.resolution)[path[0] :][::-1]
+    job, stack = worker.job, quadtree.roots(worker.job.resolution)[path[0] :][::-1]
+    out: list[Cell] = []
     for quarter in path[1:]:
         stack += quadtree.children(stack.pop())[: quarter - 1 if quarter else None : -1]
     while stack and len(out) < NEIGHBOURS:
