@@ -52,6 +52,7 @@ def measure(setting: Setting) -> Report:
     saved: list[tuple[float, str]] = []
     pilots: list[tuple[float, str]] = []
     left_out: list[tuple[float, str]] = []
+    needed: list[tuple[float, str]] = []
     effects: list[tuple[str | int | float, ...]] = []
     for make in makers:
         scene = make(cells)
@@ -67,6 +68,8 @@ def measure(setting: Setting) -> Report:
         told = ("shadows", shadows), *((name, tails[number - 1]) for name, number in BOUNCED.items())
         for name, change in told:
             planned = "simulated" if name in auto["effects"] else "skipped"
+            if planned == "simulated":
+                needed.append((change, f"{name} of {scene.name}"))
             effects.append((scene.name, name, 100 * change, planned))
         effects.append(
             (scene.name, f"after {auto['bounces']} interreflections", 100 * tails[auto["bounces"]], "skipped")
@@ -87,6 +90,11 @@ def measure(setting: Setting) -> Report:
     most, name = max(left_out)
     work = f"what all that is skipped changes, the most of {len(left_out)} scenes ({name})"
     report.rows.append(at_most(work, 100 * most, "%", 100 * TOLERANCE))
+    if needed:
+        least, name = min(needed)
+        report.rows.append(
+            Row(f"the same of what is simulated, the least of {len(needed)} effects ({name})", 100 * least, "%")
+        )
     right, of, skipped = _moving(setting)
     report.skipped += skipped
     work = "scenes with fields where an object moves and only there, and poses where a character does and only there"
