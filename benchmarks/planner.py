@@ -27,7 +27,7 @@ SAVES = 2.0  # times the seconds, where an effect is skipped
 PILOT, LEAST = 0.03, 2.0  # of the run's seconds, or so many
 CELLS, SIZE = 40, (320, 240)
 TOLERANCE = 0.1
-SMALL, SAMPLES, BOUNCES = (40, 30), 32, 6  # of pictures that show what an effect changes
+SMALL, SAMPLES, BOUNCES = (40, 30), 32, 12  # of pictures that show what an effect changes; the plan has at most 8
 BOUNCED = {"one-bounce": 1, "two-bounce": 2}
 
 

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from relightcli.stages import light_cost
+from relightcli.stages import light_cost, light_growth
 from relightcli.stages.light_clusters import Config, cluster_lights
 from tests.core.transport.scenes import lambert, sphere
 from tests.stages.scene_files import make_store, write_scene
@@ -65,16 +65,16 @@ def test_few_cells_stand_for_all(transfer, tmp_path, monkeypatch):
     """Of thousands of cells no more than KEPT a level are split, however many lights there are."""
     asked = {"resolution": 256, "epsilon": 0.02, "dry_run": True}
     judged = []
-    grow = light_cost._grow
+    grow = light_cost.grow
 
     def counted(*arguments):
         nodes = grow(*arguments)
         judged.append(len(nodes))
         return nodes
 
-    monkeypatch.setattr(light_cost, "_grow", counted)
+    monkeypatch.setattr(light_cost, "grow", counted)
     some = run(transfer, tmp_path / "t.zarr", **asked)[0]
-    monkeypatch.setattr(light_cost, "KEPT", 3 * light_cost.KEPT)
+    monkeypatch.setattr(light_growth, "KEPT", 3 * light_growth.KEPT)
     more = run(transfer, tmp_path / "t.zarr", **asked)[0]
     assert judged[0] < 0.5 * judged[1] < 0.2 * some["light_clusters"]
     assert some["light_clusters"] == pytest.approx(more["light_clusters"], rel=0.15)
