@@ -66,7 +66,7 @@ def check_skies() -> dict[str, Sky]:
 def trial_skies() -> dict[str, Sky]:
     """Skies that settings of direct light are chosen by."""
     suns = {f"sun at {up} degrees from {side}": sky_latlong(up, side, size=MAP) for up, side in TRIAL_SUNS}
-    return {**suns, "dawn": _ring(0.0, DUSK, 0.06, 4.7)}
+    return {**suns, "dawn": _ring(-5.0, DUSK, 0.03, 4.7)}
 
 
 def _ring(middle: float, wide: float, backdrop: float, side: float) -> Sky:
