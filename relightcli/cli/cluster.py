@@ -21,8 +21,10 @@ from relightcli.cli import options
     default=None,
     type=float,
     help="Relative RMS of interreflections that the basis for light may leave out. Default: a part of what precompute "
-    "has left of its tolerance, else 0.01.",
+    "has left of its tolerance, else 0.01. Lights: of radiance, all stages together. Default: precompute's, if it had "
+    "one.",
 )
+@click.option("--allow-miss", is_flag=True, help="Lights: make the store even if its error is above the tolerance.")
 @click.option(
     "--functions",
     default=4,
@@ -91,6 +93,7 @@ def command(
         from relightcli.stages.light_clusters import Config as LightConfig
         from relightcli.stages.light_clusters import cluster_lights
 
+        asked |= {name: settings[name] for name in ("tolerance", "allow_miss")}
         result = cluster_lights(LightConfig(**common, **asked, scheduler=scheduler))
         options.tell(result, _light_text(result), as_json, quiet)
         return
@@ -105,15 +108,21 @@ OF_LIGHTS = ("resolution", "epsilon", "criterion", "lights", "seconds", "camera"
 
 def _light_text(result: dict[str, Any]) -> str:
     if result.get("dry_run"):
-        text = f"{result['receivers']} receivers, {6 * result['resolution'] ** 2} lights"
+        text = (
+            f"{result['receivers']} receivers, {6 * result['resolution'] ** 2} lights in about "
+            f"{result['light_clusters']} clusters"
+        )
         if "shining_receivers" in result:
             text += f", factors for {result['shining_receivers']} receivers"
-        return text
+        return f"{text}; {options.predicted_text(result)}"
     if result["status"] == "up to date":
         return f"{result['store']} is up to date"
+    measured = ""
+    if "measured_error" in result:
+        measured = f" ({result['measured_error']:.1%} of the radiance under soft lights from anywhere)"
     return (
         f"{result['store']}: {result['lights']} lights in {result['light_clusters']} clusters, RMS error "
-        f"{result['error']:.4f} of a light overhead, {result['rays'] / 1e6:.1f} million rays, "
+        f"{result['error']:.4f} of a light overhead{measured}, {result['rays'] / 1e6:.1f} million rays, "
         f"{options.bytes_text(result['bytes'])}, {result['seconds']:.1f} s"
     )
 

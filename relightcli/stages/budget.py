@@ -39,6 +39,7 @@ BLOCKS = {
     "copy": "copying",
     "roots": "clusters",
     "round": "clusters",
+    "promise": "check",
     "refine": "clusters",
     "fraction": "clusters",
     "lobe": "clusters",
@@ -167,6 +168,12 @@ def _errors(store: formats.Store, found: dict[str, Row]) -> Iterator[tuple[str, 
             yield effect, "rounding", math.sqrt(rounding / total["norm2"])
     if store.kind == "light_clusters" and "check" in found:
         yield "clusters", "of a light overhead", found["check"]["error"]
+    if store.kind == "light_clusters" and "promise" in found:
+        yield (
+            "check",
+            "of radiance under soft lights from anywhere",
+            next(block["share"] for block in store.blocks if block["id"] == "promise"),
+        )
     if store.kind == "pose" and "measured_error" in store.attrs:
         yield "check", "of radiance in poses not learnt from", store.attrs["measured_error"]["share"]
     for block in store.blocks:

@@ -66,6 +66,10 @@ def dry_run(prepared: Prepared, account: Account, settings: dict[str, Any]) -> d
         sum(cost[key] for cost in account.steps.values()) + start[key] for key in ("seconds", "cpu_seconds")
     )
     notes = list(prepared.geometry.notes)
+    if prepared.faces == "whole":
+        notes.append(
+            "large faces stay whole; should that miss the tolerance at the end, they are cut, which takes more"
+        )
     if prepared.checked:
         check = predict_check(
             camera_of(config), prepared.scene, prepared.source, prepared.bounces, prepared.tried, light

@@ -37,7 +37,7 @@ from relightcli.stages.promise_pose import (
     Fitted,
     PoseJudge,
     keep_pose_promise,
-    poses_between,
+    places_between,
     smallest,
 )
 
@@ -113,18 +113,9 @@ def _check(config: Config) -> None:
 
 
 def _tolerance(config: Config, store: formats.Store) -> float | None:
-    """The error to keep: what was asked for, else that of a store made with one.
-
-    Raises InputError where none can be promised.
-    """
+    """The error to keep: what was asked for, else that of a store made with one."""
     own = store.settings.get("tolerance") if store.settings["basis"] == "visibility" else None
-    tolerance = config.tolerance if config.tolerance is not None else own
-    if tolerance is not None and "fields" in store.attrs:
-        raise InputError(
-            f"--tolerance: {config.store} also holds objects that may be moved, and no error is promised for the light "
-            "between these and characters; leave it out"
-        )
-    return tolerance
+    return config.tolerance if config.tolerance is not None else own
 
 
 def _chosen(
@@ -135,7 +126,7 @@ def _chosen(
     poses: dict[str, Any] = store.attrs["poses"]
     if tolerance is None or all(f"fit/{k}" in writer.done for k in poses):
         return {}
-    places = poses_between(Draft(writer), TRIAL)
+    places = places_between(Draft(writer), TRIAL)
     tried: list[dict[str, Fit]] = []
     shares: list[float] = []
     for size in SIZES:

@@ -33,9 +33,11 @@ from relightcli.run.accounting import Account, Meter
 from relightcli.stages.budget import summary
 from relightcli.stages.cluster import copy_arrays
 from relightcli.stages.light_cluster_job import DIFFUSE, LOBE, SCRATCH, ClusterJob, ClusterWorker, as_cell
+from relightcli.stages.light_cost import Work, predict_lights
 from relightcli.stages.light_factors import put_factors, shining
 from relightcli.stages.lighting import SHINY, LightingStore, need_still
 from relightcli.stages.outputs import resolve_camera
+from relightcli.stages.promise_lights import epsilon_for, keep_lights_promise, need_tolerance
 
 KIND = "light_clusters"
 MOST_RESOLUTION = 4096
@@ -51,14 +53,18 @@ RECEIVERS = 16_384  # per chunk
 class Config:
     """Everything that clustering light needs to know.
 
-    epsilon None: the criterion's default. lights, seconds: budgets; the cell with the largest contribution is then
-    split first. camera: fixes the view, for materials with specular lobes. light_factors: what many views need.
+    epsilon None: what `tolerance` takes, or else the criterion's default. tolerance: relative RMS of exit radiance, all
+    stages together; None for that of a store made with one, if it was. lights, seconds: budgets; the cell with the
+    largest contribution is then split first. camera: fixes the view, for materials with specular lobes. light_factors:
+    what many views need.
     """
 
     store: Path
     output: Path
     resolution: int = 1024
     epsilon: float | None = None
+    tolerance: float | None = None
+    allow_miss: bool = False
     criterion: str = "rms"
     lights: int | None = None
     seconds: float | None = None
@@ -84,6 +90,9 @@ def cluster_lights(config: Config) -> dict[str, Any]:
     if lighting.store.kind != "transfer":
         raise StoreError(f"{config.store}: expected a store of kind transfer, found {lighting.store.kind}.")
     view = None if config.light_factors else _fixed_view(lighting, config.camera)
+    left = need_tolerance(lighting.store, config.tolerance, config.criterion)
+    if left is not None and config.epsilon is None:
+        epsilon = epsilon_for(left, view is not None)
     settings = {
         **lighting.store.settings,
         "bounces": 0,
@@ -96,9 +105,40 @@ def cluster_lights(config: Config) -> dict[str, Any]:
         "cluster_seed": config.seed,
         **({"light_factors": True} if config.light_factors else {}),
     }
+    if left is not None:
+        settings["lights_tolerance"] = left.tolerance
+    # Lobes that are not baked in are integrated from the bits: every view, and every lobe.
+    left_out = (
+        ("direct/", "bounce/") if view is None and _may_shine(lighting) else ("visibility/", "direct/", "bounce/")
+    )
+    copied = [n for n in lighting.store.names() if not n.startswith(left_out)]
+    shadows = "shadows" in lighting.store.settings["effects"]
+    budget = config.lights is not None or config.seconds is not None
+    split = view is not None and config.criterion == "rms" and not budget
     if config.dry_run:
-        told = {"dry_run": True, "receivers": len(lighting), "resolution": config.resolution, "notes": []}
-        return {**told, "shining_receivers": shining(lighting)} if config.light_factors else told
+
+        def put(writer: formats.Writer) -> None:
+            _put_receivers(writer, lighting, view)
+            if config.light_factors:
+                put_factors(writer, lighting)
+
+        work = Work(
+            ClusterJob("", config.resolution, epsilon, config.criterion, shadows, view is not None),
+            ("diffuse", "lobes") if split else ("all",),
+            SPLIT_LEVEL,
+            config.lights,
+            config.seconds,
+            CLUSTERS,
+            1 if left is None else 2,
+            config.workers,
+            put,
+            _create_outputs,
+        )
+        costs, count = predict_lights(lighting, copied, work)
+        told: dict[str, Any] = {"dry_run": True, "receivers": len(lighting), "resolution": config.resolution}
+        if config.light_factors:
+            told["shining_receivers"] = shining(lighting)
+        return {**told, "light_clusters": count, "predicted": costs.as_json(account), "notes": []}
     writer = formats.begin(
         config.output,
         KIND,
@@ -112,12 +152,8 @@ def cluster_lights(config: Config) -> dict[str, Any]:
     with writer:
         resumed = bool(writer.done)
         writer.set_attrs(lighting.store.attrs)
-        # Lobes that are not baked in are integrated from the bits: every view, and every lobe.
-        left_out = (
-            ("direct/", "bounce/") if view is None and _may_shine(lighting) else ("visibility/", "direct/", "bounce/")
-        )
         with account.step("copying"):
-            copy_arrays(lighting.store, writer, [n for n in lighting.store.names() if not n.startswith(left_out)])
+            copy_arrays(lighting.store, writer, copied)
         _put_receivers(writer, lighting, view)
         words = -(-len(lighting) // 64)
         base = np.lib.format.open_memmap(
@@ -129,14 +165,12 @@ def cluster_lights(config: Config) -> dict[str, Any]:
         if config.light_factors:
             with account.step("factors"):
                 put_factors(writer, lighting)
-        shadows = "shadows" in lighting.store.settings["effects"]
         job = ClusterJob(
             str(writer.partial_path), config.resolution, epsilon, config.criterion, shadows, view is not None
         )
-        budget = config.lights is not None or config.seconds is not None
         parts = (DIFFUSE, LOBE) if view is not None else (DIFFUSE,)
         with account.step("clusters"):
-            if view is not None and config.criterion == "rms" and not budget:
+            if split:
                 found = [_refine(replace(job, part=p), writer, config, f"{p}-") for p in ("diffuse", "lobes")]
                 leaves = quadtree.overlay(found[0], found[1], config.resolution)
                 trees = [_in_order(cells, config.resolution) for cells in found]
@@ -171,6 +205,9 @@ def cluster_lights(config: Config) -> dict[str, Any]:
             )
         if "check" not in writer.done:
             writer.record("check", job.open().check(trees[0], config.seed))
+        if left is not None:
+            with account.step("check"):
+                keep_lights_promise(writer, job.open(), trees, left, lighting.store, config.seed, config.allow_miss)
         run.close_worker()
         del base
         writer.commit(summary(account, started, resumed, config.workers, lighting.store))
@@ -370,6 +407,7 @@ def _summary(config: Config, started: float, resumed: bool) -> dict[str, Any]:
         "light_clusters": int(store.layouts["light_clusters/cell"].shape[0]),
         "rays": sum(block.get("rays", 0.0) for block in store.blocks),
         "error": info["check"]["error"],
+        **({"measured_error": info["promise"]["share"]} if "promise" in info else {}),
         "bytes": sum(size.stored for size in store.sizes().values()),
         "peak_bytes": max((block.get("peak_bytes", 0.0) for block in store.blocks), default=0.0),
         "seconds": time.perf_counter() - started,

@@ -41,33 +41,45 @@ TURN, LIFT = 12.0, 7.0  # degrees from a camera of the scene to a view of the ch
 STEEPEST = 80.0  # degrees above the target to which a view is lifted
 MORE = 3  # interreflections that the truth has beyond the store's
 MOST_VIEWS = 2
-GLOW = 8.0  # degrees
+MAP = (128, 256)  # rows and columns of a sky
+GLOW, DUSK = 8.0, 12.0  # degrees
+TRIAL_SUNS = ((15, 30), (15, 150), (15, 270), (35, 90), (60, 210))  # degrees above the horizon, and of azimuth
 HOPELESS, GAIN = 2.0, 0.1
 
 Sky = NDArray[np.float32]
 
 
 def check_skies() -> dict[str, Sky]:
-    """Skies that nothing is chosen by."""
-    size = (128, 256)
+    """Skies that nothing is chosen by. Low suns from all sides: what they light from behind is dark in a picture and
+    full of shadows."""
     return {
-        "sun at 25 degrees": sky_latlong(25.0, 100.0, size=size),
-        "sun at 50 degrees": sky_latlong(50.0, 230.0, size=size),
-        "overcast": sky_latlong(30.0, size=size, overcast=True),
-        "glow": _glow(size),
+        "sun at 12 degrees": sky_latlong(12.0, 85.0, size=MAP),
+        "sun at 50 degrees": sky_latlong(50.0, 230.0, size=MAP),
+        "overcast": sky_latlong(30.0, size=MAP, overcast=True),
+        "sun at 20 degrees": sky_latlong(20.0, 205.0, size=MAP),
+        "glow": _ring(3.0, GLOW, 0.1, 0.5),
+        "another sun at 12 degrees": sky_latlong(12.0, 325.0, size=MAP),
+        "dusk": _ring(-4.0, DUSK, 0.03, 2.6),
     }
 
 
-def _glow(size: tuple[int, int]) -> Sky:
-    """A dim sky with a bright ring above the horizon, of GLOW degrees, warm on one side: narrow enough to fall between
-    vertices that lobes show it at, too wide to be taken apart as a sun is."""
-    height, width = size
+def trial_skies() -> dict[str, Sky]:
+    """Skies that settings of direct light are chosen by."""
+    suns = {f"sun at {up} degrees from {side}": sky_latlong(up, side, size=MAP) for up, side in TRIAL_SUNS}
+    return {**suns, "dawn": _ring(-5.0, DUSK, 0.03, 4.7)}
+
+
+def _ring(middle: float, wide: float, backdrop: float, side: float) -> Sky:
+    """A dim sky with a bright ring about the horizon, warm on one side: latitudes in degrees. Narrow enough to fall
+    between vertices that lobes show it at, too wide to be taken apart as a sun is; light that comes in level, or from
+    below, finds its way between vertices where nothing else does."""
+    height, width = MAP
     latitude = (180.0 * (0.5 - (np.arange(height) + 0.5) / height))[:, None]
     longitude = math.pi * (1.0 - 2.0 * (np.arange(width) + 0.5) / width)
-    ring = np.exp(-(((latitude - 3.0) / GLOW) ** 2))[..., None]
-    warm = (0.5 + 0.5 * np.cos(longitude + 0.5))[:, None]
+    ring = np.exp(-(((latitude - middle) / wide) ** 2))[..., None]
+    warm = (0.5 + 0.5 * np.cos(longitude + side))[:, None]
     colour = warm * np.array([3.0, 1.5, 0.5]) + (1.0 - warm) * np.array([0.6, 0.8, 1.5])
-    return (0.1 + ring * colour).astype(np.float32)  # type: ignore[no-any-return]
+    return (backdrop + ring * colour).astype(np.float32)  # type: ignore[no-any-return]
 
 
 def check_views(scene: Scene, geometry: Geometry, only: str | None) -> list[Camera]:

@@ -12,7 +12,7 @@ from relightcli.plan import pilot
 from relightcli.stages.measured_error import check_skies
 from relightcli.stages.part_cost import Costs, copying, grown, scratch, stored_bytes
 from relightcli.stages.pose_fits import DIMS, LEFT_OUT, SIZES, Config, fit_object, put_arrays
-from relightcli.stages.promise_pose import CHECK, TRIAL, Fitted, PoseJudge, poses_between
+from relightcli.stages.promise_pose import CHECK, TRIAL, Fitted, Place, PoseJudge, places_between
 
 FITTED = (1000, 1500)  # vertices that are fitted: from a thousand on, what a fit takes goes with their number
 
@@ -49,11 +49,11 @@ def predict_fit(config: Config, store: formats.Store, tolerance: float | None) -
                 found.bytes *= number == 0  # one of them is kept
                 out.add(found)
     if tolerance is not None:
-        out.add(_predict_pictures(config, Fitted(store, arrays, told), poses_between(store, CHECK), len(sizes)))
+        out.add(_predict_pictures(config, Fitted(store, arrays, told), places_between(store, CHECK), len(sizes)))
     return out
 
 
-def _predict_pictures(config: Config, store: Fitted, places: list[tuple[str, ...]], tries: int) -> Costs:
+def _predict_pictures(config: Config, store: Fitted, places: list[Place], tries: int) -> Costs:
     """What the pictures take that models are chosen by, and those of the check."""
     judge = PoseJudge(config.workers)
     skies = list(check_skies().items())

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
-from typing import Any
+from pathlib import Path
+from typing import Any, cast
 
 import relight_formats as formats
 from relightcli import __version__
@@ -34,7 +36,28 @@ def precompute(config: Config) -> dict[str, Any]:
     before = time.process_time() + children_seconds()
     need_output(config.output, store=True)
     run.need_scheduler(None if config.dry_run else config.scheduler)
-    prepared = prepare(config, account)
+    result = None
+    faces = None if config.tolerance is None or config.overwrite else _decided(config.output)
+    while result is None:
+        result = _precompute(config, started, account, faces)
+        faces = "cut"
+    if result.get("status") not in ("written", "resumed"):
+        return result
+    return {**result, "cpu_seconds": time.process_time() + children_seconds() - before}
+
+
+def _decided(output: Path) -> str | None:
+    """What an earlier run, finished or not, has decided about large faces."""
+    for settings in (lambda: formats.open_store(output).settings, lambda: formats.progress(output)["settings"]):
+        with contextlib.suppress(formats.RelightError, OSError, ValueError):
+            return cast("str | None", settings().get("faces"))
+    return None
+
+
+def _precompute(config: Config, started: float, account: Account, faces: str | None) -> dict[str, Any] | None:
+    """`precompute`; None where large faces that were kept whole have missed the tolerance. faces: as `prepare` has
+    it."""
+    prepared = prepare(config, account, faces)
     if config.dry_run:
         return dry_run(prepared, account, _settings(prepared))
     inputs = scene_inputs(scene := prepared.scene)
@@ -87,7 +110,7 @@ def precompute(config: Config) -> dict[str, Any]:
                 if prepared.promise is None:
                     put_fields(writer, moving, scene, config.fields, config.workers, config.quiet, config.scheduler)
                 else:
-                    choose_fields(config, prepared.promise, scene, source, starts, writer)
+                    choose_fields(config, prepared.promise, scene, source, starts, writer, prepared.posed)
         if "pose" in prepared.simulated:
             with account.step("pose"):
                 simulate_poses(
@@ -108,7 +131,7 @@ def precompute(config: Config) -> dict[str, Any]:
                 keep_promise_moving(config, prepared.promise, scene, source, writer)
         elif prepared.checked and prepared.promise is not None:
             with account.step("check"):
-                keep_promise(
+                kept = keep_promise(
                     prepared.config,
                     prepared.promise,
                     prepared.resolution,
@@ -119,10 +142,13 @@ def precompute(config: Config) -> dict[str, Any]:
                     receivers,
                     buried,
                     writer,
+                    prepared.faces,
                 )
+            if not kept:
+                writer.abandon()
+                return None
         writer.commit(summary(account, started, resumed, config.workers))
-    cpu_seconds = time.process_time() + children_seconds() - before
-    return {**_summary(config, started, resumed, geometry), "cpu_seconds": cpu_seconds}
+    return _summary(config, started, resumed, geometry)
 
 
 def _settings(prepared: Prepared) -> dict[str, Any]:
@@ -146,6 +172,8 @@ def _settings(prepared: Prepared) -> dict[str, Any]:
         settings["fields"] = config.fields.as_json()
     if prepared.promise is not None:
         settings["tolerance"] = prepared.promise
+    if prepared.faces is not None:
+        settings["faces"] = prepared.faces
     if config.basis == "haar":
         settings |= {"coefficients": config.coefficients, "tolerance": config.tolerance}
     if "pose" in prepared.simulated:

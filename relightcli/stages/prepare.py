@@ -23,8 +23,9 @@ from relightcli.scene.model import Geometry, Material, Scene
 from relightcli.scene.parse import load_scene
 from relightcli.stages.fields import Moving, add_points, find_movers, place, without
 from relightcli.stages.inputs import named_files, stamps
+from relightcli.stages.measured_error import Judge
 from relightcli.stages.precompute_config import RESOLUTION, Config, check_bounces, check_config
-from relightcli.stages.promise import Tried, choose, try_settings
+from relightcli.stages.promise import Tried, choose, direct_keeps, try_settings
 from relightcli.stages.promise_moving import rungs
 from relightcli.stages.receiver_setup import (
     PixelReceivers,
@@ -58,6 +59,7 @@ class Prepared:
     resolution: int = RESOLUTION
     tried: tuple[Tried, ...] = ()  # settings, each with its error
     read: dict[Path, tuple[int, int, int]] = field(default_factory=dict)  # `stamps` of the scene's files before that
+    faces: str | None = None  # "whole" or "cut", where the tolerance decides about faces too large to carry shadows
 
     @property
     def simulated(self) -> list[str]:
@@ -128,8 +130,9 @@ class Prepared:
         return vertices, buried, (0,)
 
 
-def prepare(config: Config, account: Account) -> Prepared:
-    """Reads the scene and decides. Raises InputError where settings do not go with the scene."""
+def prepare(config: Config, account: Account, faces: str | None = None) -> Prepared:
+    """Reads the scene and decides. faces: "whole" or "cut", as an earlier run has decided. Raises InputError where
+    settings do not go with the scene."""
     check_config(config)
     asked = effects.parse_effects(config.effects)
     wanted = effects.bounces_asked(asked, config.bounces)
@@ -164,11 +167,6 @@ def prepare(config: Config, account: Account) -> Prepared:
         check_bounces(config)
     plan += [pose, fields]
     simulated = [d.effect for d in plan if d.simulate]
-    if promise is not None and {"pose", "fields"} <= set(simulated):
-        raise InputError(
-            f"--tolerance: {scene.path} has characters and objects that may be moved, and no error is promised for the "
-            "light between these; leave it out, or name effects without pose or without fields"
-        )
     shadows = "shadows" in simulated
     bounce_cells = 0
     if "one-bounce" in simulated:
@@ -198,19 +196,30 @@ def prepare(config: Config, account: Account) -> Prepared:
         read=read,
     )
     on_pixels = config.receivers != "vertices"
-    if promise is None or (config.light_resolution is not None and (config.pixel_grid is not None or not on_pixels)):
+    may_stay = promise is not None and not on_pixels and moving is None and prepared.checked and uncut is not source
+    settled = config.light_resolution is not None and (config.pixel_grid is not None or not on_pixels)
+    if promise is None or (settled and not may_stay):
         return prepared
+    judge = Judge(scene, source, Tracer(source.positions, source.faces))
 
-    def receivers_of(grid: int) -> tuple[Receivers | PixelReceivers, NDArray[np.bool_] | None]:
-        own = config if grid == config.grid else replace(config, pixel_grid=grid)
-        return replace(prepared, config=own).receivers()[:2]
+    def tried_with(own: Prepared) -> Prepared:
+        def receivers_of(grid: int) -> tuple[Receivers | PixelReceivers, NDArray[np.bool_] | None]:
+            asked = config if grid == config.grid else replace(config, pixel_grid=grid)
+            return replace(own, config=asked).receivers()[:2]
 
-    with account.step("resolution"):
-        tried = try_settings(config, scene, source, geometry, receivers_of, promise)
-    chosen = choose(tried, promise)
-    if on_pixels:
-        config = replace(config, pixel_grid=chosen.grid)
-    return replace(prepared, config=config, resolution=chosen.resolution, tried=tuple(tried))
+        with account.step("resolution"):
+            tried = try_settings(config, judge, own.geometry, receivers_of, promise)
+        chosen = choose(tried, promise)
+        changed = replace(config, pixel_grid=chosen.grid) if on_pixels else config
+        return replace(own, config=changed, resolution=chosen.resolution, tried=tuple(tried))
+
+    if not may_stay:
+        return tried_with(prepared)
+    if faces != "cut":
+        whole = tried_with(replace(prepared, uncut=source, geometry=source, faces="whole"))
+        if faces == "whole" or direct_keeps(whole.tried, promise):
+            return whole
+    return tried_with(replace(prepared, faces="cut"))
 
 
 class _Pilot:

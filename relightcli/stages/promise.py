@@ -29,6 +29,7 @@ from relightcli.stages.measured_error import (
     edit_of,
     pixel_strips,
     trial,
+    trial_skies,
     vertex_strips,
 )
 from relightcli.stages.promise_moving import check_moved
@@ -79,9 +80,11 @@ class Tried:
 
 
 def try_settings(
-    config: Config, scene: Scene, source: Geometry, geometry: Geometry, receivers_of: Receiving, promise: float
+    config: Config, judge: Judge, geometry: Geometry, receivers_of: Receiving, promise: float
 ) -> list[Tried]:
-    """Errors of direct light by grid of pixels and resolution, up to what will do, in the pilot's views and skies.
+    """Errors of direct light by grid of pixels and resolution, up to what will do, in the pilot's views.
+    judge: of the scene as it is; geometry: the mesh that receivers are on.
+
     What was asked for is all that is tried of it. A finer grid is tried from the coarsest resolution on that was as
     good as any with the one before."""
     resolutions = [r for r in RESOLUTIONS if config.refine * 4 <= r]
@@ -90,9 +93,8 @@ def try_settings(
     only = camera_of(config)
     grids: tuple[int, ...] = (config.grid,)
     if config.pixel_grid is None and only:
-        width, height = scene.cameras[only].size
+        width, height = judge.scene.cameras[only].size
         grids = tuple(grid for grid in GRIDS if grid == 1 or grid**2 * width * height <= MOST_RECEIVERS)
-    judge = Judge(scene, source, Tracer(source.positions, source.faces))
     out: list[Tried] = []
     for grid in grids:
         receivers, buried = receivers_of(grid)
@@ -131,7 +133,7 @@ def _try_resolutions(
         _strips(scene, geometry, receivers, buried, cameras),
         resolutions,
         config.refine,
-        {name: sky.radiance for name, sky in pilot.skies(False)},
+        trial_skies(),
         most,
         config.seed,
     )
@@ -143,6 +145,11 @@ def choose(tried: list[Tried], promise: float) -> Tried:
     least = min(one.error.share for one in tried)
     most = max(DIRECT * promise, (1.0 + GAIN) * least)
     return next(one for one in tried if one.error.share <= most)
+
+
+def direct_keeps(tried: Sequence[Tried], promise: float) -> bool:
+    """Whether any of the settings keeps its part of the tolerance."""
+    return any(one.error.share <= DIRECT * promise for one in tried)
 
 
 def need_reach(config: Config, promise: float, scene: Scene, tried: Sequence[Tried], finer_helps: bool) -> None:
@@ -208,8 +215,10 @@ def keep_promise(
     receivers: Receivers | PixelReceivers,
     buried: NDArray[np.bool_] | None,
     writer: formats.Writer,
-) -> None:
-    """Measures the error of what was made and keeps it with it; raises NumericalError where it is too large.
+    faces: str | None = None,
+) -> bool:
+    """Measures the error of what was made and keeps it with it; raises NumericalError where it is too large. False
+    where it is, and faces that were kept "whole" have not been cut yet.
 
     finer_helps: it is not known that a finer resolution of light would change nothing.
     """
@@ -221,8 +230,12 @@ def keep_promise(
     edit = edit_of(scene.materials, set(scene.materials))
     found = judge.error(lighting, strips, skies, bounces, bounces + MORE, edit, promise)
     _keep(writer, found, promise)
-    if found.share <= promise or config.allow_miss:
-        return
+    if found.share <= promise:
+        return True
+    if faces == "whole":
+        return False
+    if config.allow_miss:
+        return True
     direct = judge.error(lighting, strips, skies, 0, 0, None, DIRECT * promise)
     if direct.share <= DIRECT * promise:
         knob = f"--bounces {bounces + 1}, a finer --bounce-resolution, or a finer mesh to bounce light off"

@@ -1,7 +1,8 @@
 """`precompute --tolerance` where objects may be moved: fields that keep it, and the error with objects in other places.
 
 Fields are simulated from coarse to fine until pictures of moved objects, every effect together, are near enough to path
-tracing; the others are dropped. The check at the end moves the objects elsewhere.
+tracing; the others are dropped. The check at the end moves the objects elsewhere. Characters are away meanwhile: how
+they are lit is known once they can be posed (`promise_pose`).
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 import relight_formats as formats
 from relightcli.adapters.rays import Tracer
@@ -68,10 +70,18 @@ def rungs(asked: FieldSettings) -> list[FieldSettings]:
 
 
 def choose_fields(
-    config: Config, promise: float, scene: Scene, source: Geometry, starts: tuple[int, ...], writer: formats.Writer
+    config: Config,
+    promise: float,
+    scene: Scene,
+    source: Geometry,
+    starts: tuple[int, ...],
+    writer: formats.Writer,
+    away: tuple[int, ...] = (),
 ) -> None:
     """Puts the coarsest fields that keep the tolerance into the store; where none do, the coarsest that are as good as
-    any. What was tried is kept with the store, so that a run goes on where it stopped."""
+    any. What was tried is kept with the store, so that a run goes on where it stopped. away: objects that pictures are
+    made without."""
+    source = _without(source, away)
     told: list[dict[str, Any]] = list(writer.attrs.get("fields_tried", []))
     ladder = rungs(config.fields)
     places = [free_moves(scene, source, turn) for turn in TRIAL]
@@ -80,7 +90,7 @@ def choose_fields(
     for number, settings in enumerate(ladder):
         if number >= len(told):
             _put(config, scene, settings, number, starts, writer)
-            lighting = _open(writer, config.workers)
+            lighting = _open(writer, config.workers, away)
             found = moved_error(lighting, scene, source, places, cameras[:1], skies, CHOSEN * promise)
             told.append({**settings.as_json(), "share": found.share, "where": found.where})
             writer.set_attrs({"fields_tried": told})
@@ -111,8 +121,28 @@ def _put(
     put_fields(writer, moving, scene, settings, config.workers, config.quiet, config.scheduler, first)
 
 
-def _open(writer: formats.Writer, threads: int) -> MovingStore:
-    lighting = MovingStore(cast("formats.Store", Draft(writer)), threads)
+def _without(geometry: Geometry, away: tuple[int, ...]) -> Geometry:
+    """The same without the faces of some objects."""
+    there = ~np.isin(geometry.face_object, away)
+    return replace(geometry, faces=geometry.faces[there], face_object=geometry.face_object[there])
+
+
+class _Thinned(Draft):
+    """A store without the faces of some objects."""
+
+    def __init__(self, writer: formats.Writer, away: tuple[int, ...]) -> None:
+        super().__init__(writer)
+        self.there = ~np.isin(writer.read("mesh/face_object"), away)
+        self.read = self._read
+
+    def _read(self, name: str) -> NDArray[Any]:
+        found = self.writer.read(name)
+        return found[self.there] if name in ("mesh/face", "mesh/face_object") else found
+
+
+def _open(writer: formats.Writer, threads: int, away: tuple[int, ...] = ()) -> MovingStore:
+    store = _Thinned(writer, away) if away else Draft(writer)
+    lighting = MovingStore(cast("formats.Store", store), threads)
     lighting.apart = False
     return lighting
 

@@ -1,7 +1,8 @@
 """`fit-pose --tolerance`: a model of visibility that keeps it, in pictures of poses that nothing was learnt from.
 
 Models are fitted from small to large until pictures of characters between their training frames, every effect together,
-are near enough to path tracing. The check at the end takes other moments, views and skies.
+are near enough to path tracing. The check at the end takes other moments, views and skies. Where objects may be moved
+as well, every second picture has them elsewhere.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from relightcli.errors import NumericalError
 from relightcli.plan import pilot
 from relightcli.plan.pilot import NOTHING, Share
 from relightcli.scene.model import Camera
+from relightcli.stages.lighting import read_scene
 from relightcli.stages.measured_error import (
     GAIN,
     MORE,
@@ -31,11 +33,16 @@ from relightcli.stages.measured_error import (
     vertex_strips,
 )
 from relightcli.stages.posed import PoseStore
+from relightcli.stages.posed_moving import PosedMovingStore
+from relightcli.stages.promise_moving import free_moves
 
 CHOSEN = 0.8  # of the tolerance: what pictures that a model is chosen by may be off by
 # Poses, as where among the gaps between training frames, and where in such a gap: to choose by, and of the check.
 TRIAL = ((0.3, 0.5), (0.8, 0.5))
 CHECK = ((0.1, 0.35), (0.55, 0.65))
+# Where moves begin to look for their way, in azimuths (`promise_moving.free_moves`).
+TURNS: dict[tuple[tuple[float, float], ...], float] = {TRIAL: 1.7, CHECK: 6.4}
+Place = tuple[tuple[str, ...], tuple[str, ...]]  # what `--pose` and `--move` take
 
 
 class Fitted:
@@ -65,39 +72,62 @@ class PoseJudge:
     """Path tracing of posed characters, kept from one model to the next."""
 
     threads: int
-    known: dict[tuple[str, ...], Judge] = field(default_factory=dict)
+    known: dict[Place, Judge] = field(default_factory=dict)
 
     def error(
         self,
         store: Posable,
-        places: list[tuple[str, ...]],
+        places: list[Place],
         cameras: list[Camera] | None,
         skies: dict[str, Sky],
         most: float,
     ) -> Share:
-        """The largest error over poses, views and skies. places: each what `--pose` takes; cameras: those of the check
-        if None."""
-        lighting = PoseStore(cast("formats.Store", store), self.threads)
+        """The largest error over places, views and skies. cameras: those of the check if None."""
+        lighting = _open(store, self.threads)
         scene, worst = lighting.scene, NOTHING
         views = cameras or check_views(scene, lighting.geometry, None)
-        for poses in places:
+        editable = lighting.editable if isinstance(lighting, PosedMovingStore) else set(scene.materials)
+        for poses, moves in places:
+            if isinstance(lighting, PosedMovingStore):
+                lighting.set_moves(moves)
             lighting.set_poses(poses)
             geometry = lighting.geometry
             tracer = Tracer(geometry.positions, geometry.faces)
-            judge = self.known.setdefault(poses, Judge(scene, geometry, tracer))
+            judge = self.known.setdefault((poses, moves), Judge(scene, geometry, tracer))
             front, back = lighting.receiver_of_vertex()
             strips = [vertex_strips(geometry, tracer, view, front, back, lighting.buried()) for view in views]
-            edit = edit_of(scene.materials, set(scene.materials))
+            edit = edit_of(scene.materials, editable)
             found = judge.error(lighting, strips, skies, lighting.bounces, lighting.bounces + MORE, edit, most)
             if found.bound > worst.bound:
-                worst = replace(found, where=f"{found.where}, {' '.join(poses)}")
+                where = f"{found.where}, {' '.join(poses)}" + (", objects moved" if moves else "")
+                worst = replace(found, where=where)
         return worst
 
-    def trial(self, store: Posable, places: list[tuple[str, ...]], tolerance: float) -> Share:
+    def trial(self, store: Posable, places: list[Place], tolerance: float) -> Share:
         """The error by which models are chosen."""
         scene = PoseStore(cast("formats.Store", store), self.threads).scene
         skies = {name: sky.radiance for name, sky in pilot.skies(False)}
         return self.error(store, places, list(scene.cameras.values())[:1] or None, skies, CHOSEN * tolerance)
+
+
+def _open(store: Posable, threads: int) -> PoseStore:
+    if "fields" not in store.attrs:
+        return PoseStore(cast("formats.Store", store), threads)
+    lighting = PosedMovingStore(cast("formats.Store", store), threads)
+    lighting.apart = False
+    return lighting
+
+
+def places_between(store: Draft | formats.Store, where: tuple[tuple[float, float], ...]) -> list[Place]:
+    """`poses_between`; where objects may be moved, every second one with them elsewhere."""
+    out: list[Place] = []
+    scene, source = read_scene(cast("formats.Store", store))
+    for number, poses in enumerate(poses_between(store, where)):
+        moves: tuple[str, ...] = ()
+        if "fields" in store.attrs and number % 2:
+            moves = free_moves(scene, source, TURNS[where])
+        out.append((poses, moves))
+    return out
 
 
 def poses_between(store: Draft | formats.Store, where: tuple[tuple[float, float], ...]) -> list[tuple[str, ...]]:
@@ -134,7 +164,7 @@ def keep_pose_promise(
 ) -> None:
     """Measures the error in poses that nothing was chosen by and keeps it with the store; raises NumericalError where
     it is more than the tolerance. reports: of the fits, by object's number."""
-    found = judge.error(Draft(writer), poses_between(Draft(writer), CHECK), None, check_skies(), tolerance)
+    found = judge.error(Draft(writer), places_between(Draft(writer), CHECK), None, check_skies(), tolerance)
     measured: dict[str, Any] = {"share": found.share, "where": found.where, "tolerance": tolerance}
     if np.isfinite(found.bound):
         measured["bound"] = found.bound
@@ -159,4 +189,6 @@ def _knob(writer: formats.Writer, reports: dict[str, Report]) -> str:
         more = "precompute --pose-frames all"
     else:
         more = "clips with more frames"
+    if "fields" in writer.attrs:
+        more += f" or --field-order {1 + int(writer.attrs['fields']['settings']['order'])}"
     return f"{more}, or a finer mesh"

@@ -23,7 +23,7 @@ from tests.stages.test_promise import grid
 
 CAMERA = Camera("main", (0, 1.6, 2.6), (0, 0.3, 0), fov=40, size=(40, 30))
 SETTINGS = {"receivers": "vertices", "basis": "visibility", "bounces": 2, "light_resolution": 16}
-PICTURES = 4 * 1  # skies and views of the check
+PICTURES = 7 * 1  # skies and views of the check
 
 
 def both(value):

@@ -6,12 +6,14 @@ import itertools
 
 import numpy as np
 import pytest
+import trimesh
 
 import relight_formats as formats
 from relightcli.adapters.images import write_image
 from relightcli.errors import InputError, NumericalError
-from relightcli.scene.model import Camera
-from relightcli.stages.measured_error import check_skies, edited, rows_of
+from relightcli.scene.model import Camera, Material
+from relightcli.scene.shapes import lathe
+from relightcli.stages.measured_error import check_skies, edited, rows_of, trial_skies
 from relightcli.stages.precompute import precompute
 from relightcli.stages.precompute_config import Config
 from relightcli.stages.relight import Config as RelightConfig
@@ -68,10 +70,45 @@ def test_error_is_measured_and_is_the_true_one(scene, tmp_path):
     assert store.settings["light_resolution"] == tried[-1]["light_resolution"]
     assert all(t["share"] > 0.08 for t in tried[:-1])
     assert tried[-1]["share"] <= 0.08
-    found = {name: true_error(tmp_path / "t.zarr", name.replace(" ", "-"), sky) for name, sky in check_skies().items()}
+    skies = check_skies()
+    some = ("sun at 50 degrees", "sun at 20 degrees", "overcast", "dusk")
+    found = {name: true_error(tmp_path / "t.zarr", name.replace(" ", "-"), skies[name]) for name in some}
     # Another view, and other pixels of it.
     assert max(found.values()) == pytest.approx(measured["share"], rel=0.5)
     assert max(found.values()) <= 0.1
+
+
+def test_level_light_is_seen_to_fall_between_vertices(tmp_path):
+    """A vase of five rows of vertices: what comes in level or from below is lost between the lowest two, under a sky
+    that the check does not have as well."""
+    corners, faces = lathe([(0.25, 0.0), (0.45, 0.3), (0.4, 0.6), (0.15, 0.9), (0.25, 1.1)], 48)
+    smooth = np.array(trimesh.Trimesh(corners, faces, process=False).vertex_normals)
+    plastic = Material("", "blinn-phong", (0.2, 0.3, 0.5), (0.15, 0.15, 0.15), shininess=40.0)
+    vase = Part(corners, faces, smooth, material=plastic)
+    parts = {"vase": vase, "ground": grid(3, 24, lambert((0.45, 0.4, 0.35)))}
+    path = write_scene(tmp_path, parts, [CAMERA], {})
+    store = tmp_path / "t.zarr"
+    run(path, store, tolerance=0.05, light_resolution=32, bounces=1, allow_miss=True)
+    measured = formats.open_store(store).attrs["measured_error"]
+    assert "dusk" in measured["where"]
+    latitude = 90.0 - 180.0 * (np.arange(64) + 0.5) / 64
+    band = 0.05 + np.exp(-((latitude / 10.0) ** 2))[:, None, None] * np.tile([0.5, 1.0, 2.0], (1, 128, 1))
+    found = true_error(store, "band", band.astype(np.float32))
+    assert found > 0.05
+    assert measured["share"] > 0.8 * found  # a fifth for the other view
+
+
+def test_some_low_sun_stands_behind_the_scene():
+    """Whatever a camera's azimuth, what is dark in its picture, and full of shadows, is in a trial and in the check."""
+    for skies in (check_skies(), trial_skies()):
+        low = []
+        for name, sky in skies.items():
+            if "sun" in name:
+                row, column = np.unravel_index(sky.sum(axis=2).argmax(), sky.shape[:2])
+                if 90.0 - 180.0 * (row + 0.5) / len(sky) < 25.0:
+                    low.append(180.0 - 360.0 * (column + 0.5) / sky.shape[1])
+        apart = [min(abs((azimuth - sun + 180.0) % 360.0 - 180.0) for sun in low) for azimuth in range(360)]
+        assert max(apart) < 65.0
 
 
 def test_a_smaller_tolerance_takes_more(scene, tmp_path):

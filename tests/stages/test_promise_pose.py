@@ -11,7 +11,6 @@ import relight_formats as formats
 from relightcli.adapters.images import write_image
 from relightcli.cli.main import run as run_command
 from relightcli.core.lights.sky import sky_latlong
-from relightcli.errors import InputError
 from relightcli.stages import measured_error
 from relightcli.stages.budget import budget
 from relightcli.stages.fit_pose import Config, fit_pose
@@ -91,10 +90,3 @@ def test_poses_are_none_of_those_learnt_from(transfer):
         assert name == "bar=bend"
         assert min(frames) < float(seconds) < max(frames)
         assert float(seconds) not in frames
-
-
-def test_what_is_not_promised(tmp_path):
-    text = SCENE.replace('[objects.floor]\nmesh = "floor.obj"', '[objects.floor]\nmesh = "floor.obj"\nmotion = "rigid"')
-    scene = pose_scene(tmp_path, text)
-    with pytest.raises(InputError, match=r"characters and objects that may be moved"):
-        make_store(scene, tolerance=0.3, **SMALL)
