@@ -55,8 +55,9 @@ def measure(setting: Setting) -> Report:
         worst = dict.fromkeys(LAYERS, 0.0)
         most = 0.0
         for moves in made.places[:1] if setting.quick else made.places:
-            ours, milliseconds = _picture(store, sky, moves)
-            refs = _references(store, sky, moves, spp)
+            edit = made.scene.edit
+            ours, milliseconds = _picture(store, sky, moves, settings=edit)
+            refs = _references(store, sky, moves, spp, settings=edit)
             errors = {name: error(ours[name], *(r[name] for r in refs)) for name in LAYERS}
             flip = float(flip_hdr(ours[""], 0.5 * (refs[0][""] + refs[1][""])).mean())
             worst = {name: max(worst[name], errors[name]) for name in LAYERS}
@@ -176,7 +177,7 @@ def _picture(store: Path, sky: Path, moves: tuple[str, ...], **more: Any) -> tup
     return _read(output), 1e3 * again["lighting_seconds"]
 
 
-def _references(store: Path, sky: Path, moves: tuple[str, ...], spp: int) -> list[Picture]:
+def _references(store: Path, sky: Path, moves: tuple[str, ...], spp: int, **more: Any) -> list[Picture]:
     """Two that do not know of each other."""
     from relightcli.stages.relight import Config, relight
 
@@ -196,6 +197,7 @@ def _references(store: Path, sky: Path, moves: tuple[str, ...], spp: int) -> lis
                 workers=cores(),
                 overwrite=True,
                 quiet=True,
+                **more,
             )
         )
         out.append(_read(output))

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 import relight_formats as formats
 from relightcli.adapters.rays import Tracer
 from relightcli.core.fields.body import Body
-from relightcli.core.fields.build import field_samples
+from relightcli.core.fields.build import field_samples, short
 from relightcli.core.fields.compression import compress
 from relightcli.core.fields.self_transfer import exits_of, solve
+from relightcli.core.fields.shared_exits import SharedExits
 from relightcli.run import blocks as run
 from relightcli.scene.model import Material
 from relightcli.stages.bodies import body_of
@@ -118,7 +119,7 @@ class SampleWorker:
         self.first = [0]
         for spec in job.fields:
             self.first.append(self.first[-1] + spec.shells * spec.cells)
-        self.opened: tuple[int, Body, Tracer, NDArray[np.float32], NDArray[np.float64]] | None = None
+        self.opened: tuple[int, Body, Tracer, NDArray[np.float32] | SharedExits, NDArray[np.float64]] | None = None
 
     def run(self, block: run.Block) -> run.Info:
         k = bisect.bisect_right(self.first, block.start) - 1
@@ -128,7 +129,8 @@ class SampleWorker:
             body, tracer = open_body(self.job.partial, spec)
             transfer: Any = formats.worker_array(self.job.partial, f"{spec.prefix}{WORK}/self")[...]
             radii: Any = formats.worker_array(self.job.partial, f"{spec.prefix}radii")[:]
-            self.opened = k, body, tracer, exits_of(body, transfer), radii
+            proxies: Any = formats.worker_array(self.job.partial, f"{spec.prefix}proxies")[:]
+            self.opened = k, body, tracer, short(body, exits_of(body, transfer), proxies), radii
         _, body, tracer, exits, radii = self.opened
         start, stop = block.start - self.first[k], block.stop - self.first[k]
         found = field_samples(tracer, body, exits, radii, spec.resolution, start, stop, rays=spec.rays, seed=spec.seed)

@@ -21,7 +21,7 @@ from relightcli.adapters.rays import Tracer
 from relightcli.core.fields.adaptive import adaptive_radii, least_resolution
 from relightcli.core.fields.albedos import NODES
 from relightcli.core.fields.body import Body
-from relightcli.core.fields.build import RAYS, field_samples
+from relightcli.core.fields.build import RAYS, field_samples, short
 from relightcli.core.fields.field import shell_radii
 from relightcli.core.fields.proxies import place_proxies
 from relightcli.core.fields.sources import source_field
@@ -298,7 +298,7 @@ def predict(moving: Moving) -> tuple[float, float, float]:
         spec, body = field.spec, field.body
         tracer = Tracer(body.positions, body.faces)
         lights = spec.proxies * spec.order**2 * spec.colours
-        dark = np.zeros((spec.points, body.terms, lights), np.float32)
+        dark = short(body, np.zeros((spec.points, body.terms, lights), np.float32), field.proxies)
         for _ in range(2):  # the first run pays for compilation
             clock = time.perf_counter()
             for shell in np.linspace(0, spec.shells - 1, PILOT_SHELLS).astype(int):
