@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from relightcli.core.fields.body import Body, axes
 from relightcli.core.fields.field import Field, SelfTransfer, shell_radii
+from relightcli.core.fields.lobe_functions import FunctionExits, gather_by_function
 from relightcli.core.fields.proxies import place_proxies, proxy_weights
 from relightcli.core.fields.sampling import blocked, cone_rays, gather, sample_points, trace
 from relightcli.core.fields.self_transfer import solve
@@ -27,6 +28,7 @@ from relightcli.core.transport.tracer import Tracer
 
 RAYS = 1024  # of a sample, through the cone of the bounding sphere; four times as many from inside it
 _BATCH = 64  # samples traced together
+Exits: TypeAlias = NDArray[np.float32] | SharedExits | FunctionExits
 
 
 class Samples(NamedTuple):
@@ -41,7 +43,7 @@ class Samples(NamedTuple):
 def field_samples(
     tracer: Tracer,
     body: Body,
-    exits: NDArray[np.float32] | SharedExits,
+    exits: Exits,
     radii: NDArray[np.float64],
     resolution: int,
     start: int,
@@ -49,13 +51,14 @@ def field_samples(
     rays: int = RAYS,
     seed: int = 0,
 ) -> Samples:
-    """Samples start .. stop, counted through all shells. exits (P, terms, m N C) from `self_transfer.solve`, as it is
-    or from `short`.
+    """Samples start .. stop, counted through all shells. exits (P, terms, m N C) from `self_transfer.solve`, as it is,
+    from `short`, or by the functions of `lobe_functions`, which take the place of colours.
 
     A sample is not valid if more than half of what is seen from it are backs of one-sided faces: it lies inside.
     """
-    n, colours = body.order**2, body.colours
-    lights = exits.lights if isinstance(exits, SharedExits) else exits.shape[2]
+    n = body.order**2
+    lights = exits.shape[2] if isinstance(exits, np.ndarray) else exits.lights
+    colours = 1 + len(exits.table) if isinstance(exits, FunctionExits) else body.colours
     proxies = lights // (n * colours)
     frames = axes(body.normal)
     valid = np.ones(stop - start, bool)
@@ -75,6 +78,8 @@ def field_samples(
         occlusion[rows] = -hidden
         if isinstance(exits, SharedExits):
             seen = gather_shared(found, harmonics, exits, body, frames)
+        elif isinstance(exits, FunctionExits):
+            seen = gather_by_function(found, harmonics, exits, body, frames)
         else:
             seen = gather(found, harmonics, exits, body, frames)
         transfer[rows] = seen.reshape(-1, n, proxies, n, colours).transpose(0, 2, 1, 3, 4)

@@ -16,13 +16,13 @@ left of d is LEFT of e, in the root of the sum of squares. A row of 16 m numbers
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from relightcli.core.compress.span import span
 from relightcli.core.fields.body import Body, fill_basis
 from relightcli.core.fields.sampling import Found
 
@@ -56,7 +56,7 @@ def share_exits(exits: NDArray[np.float32], weight: NDArray[np.float64], left: f
     rest = np.ascontiguousarray(apart - weight[:, None, :, None] * whole[:, :, None, :], np.float32)
     rest = rest.reshape(points * terms, lights)
     norm2 = float(np.einsum("ptk,ptk->", exits, exits, dtype=np.float64))
-    chosen, basis = _span(_gram(rest), max(left, _ROUND_OFF) ** 2 * norm2)
+    chosen, basis = span(_gram(rest), max(left, _ROUND_OFF) ** 2 * norm2, group=_LANES)
     row = np.concatenate([whole.astype(np.float32), rest[:, chosen].reshape(points, terms, -1)], axis=2)
     return SharedExits(weight.astype(np.float32), row, basis.astype(np.float32))
 
@@ -77,31 +77,6 @@ def _gram(rows: Any) -> Any:
     for i in range(n):
         out[i:, i] = out[i, i:]
     return out
-
-
-def _span(gram: NDArray[np.float64], allowed: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Columns (r,) that span all others but for `allowed` of their squares' sum, and the others (r, n) as combinations
-    of them: Cholesky's factors with pivots of the Gram matrix, turned into those of the chosen."""
-    n = len(gram)
-    left = np.diag(gram).copy()
-    factors = np.zeros((n, n))
-    chosen: list[int] = []
-    while len(chosen) < n and (left.sum() > allowed or len(chosen) % _LANES):
-        k, at = len(chosen), int(left.argmax())
-        if not left[at] > 0.0:
-            break
-        so_far = (factors[:k, at, None] * factors[:k]).sum(axis=0)
-        factors[k] = (gram[at] - so_far) / math.sqrt(left[at])
-        factors[k, chosen] = 0.0
-        left = np.maximum(left - factors[k] ** 2, 0.0)
-        left[at] = 0.0
-        chosen.append(at)
-    columns = np.array(chosen, np.int64)
-    basis = factors[: len(chosen)].copy()
-    for k in range(len(chosen) - 1, -1, -1):  # back substitution: the chosen ones become the unit matrix
-        basis[k] -= (basis[k, columns[k + 1 :], None] * basis[k + 1 :]).sum(axis=0)
-        basis[k] /= factors[k, columns[k]]
-    return columns, basis
 
 
 def gather_shared(
