@@ -156,7 +156,7 @@ def edited(cells: int, detail: int) -> MovingScene:
     }
     edit = (
         *("brass.diffuse=0.6,0.2,0.1", "brass.specular=0.1,0.1,0.1", "brass.f0=0.3", "brass.roughness=0.5"),
-        *("lacquer.diffuse=0.05,0.05,0.05", "lacquer.specular=0.9,0.8,0.6", "lacquer.f0=0.8", "lacquer.roughness=0.15"),
+        *("lacquer.diffuse=0.05,0.05,0.05", "lacquer.specular=0.9,0.8,0.6", "lacquer.f0=0.8", "lacquer.roughness=0.4"),
         "paint.diffuse=0.1,0.3,0.8",
     )
     about = "three movers, all of their materials changed"

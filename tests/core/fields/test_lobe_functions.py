@@ -27,7 +27,7 @@ OLD = Material("m", "cook-torrance", (0.6, 0.5, 0.4), (0.1, 0.1, 0.1), f0=0.2, r
 NEW = Material("m", "cook-torrance", (0.05, 0.1, 0.05), (0.9, 0.8, 0.6), f0=0.8, roughness=0.15)
 
 
-@pytest.mark.parametrize(("model", "bound"), [(COOK_TORRANCE, 0.065), (BLINN_PHONG, 0.02)])
+@pytest.mark.parametrize(("model", "bound"), [(COOK_TORRANCE, 0.085), (BLINN_PHONG, 0.02)])
 def test_lobes_are_mixes(model, bound):
     """Of all widths, those of mirrors (f0 = 1) relative to their own norm, of f0 = 0 to that of the mirror as wide.
     Scaling to the right power takes the mix a little off the best one. Bounds: what was measured, rounded up."""
