@@ -75,6 +75,17 @@ def lamp(cells: int, detail: int) -> MovingScene:
     return made
 
 
+def bar(cells: int, detail: int) -> MovingScene:
+    """A bar over a floor, with a lamp between them beside its end: light differs along it, and from below."""
+    mesh = _centered(rounded((1.6, 0.3, 0.3), power=8, subdivisions=detail))
+    objects = {"floor": (_floor(2 * cells, 2.0), "grey"), "bar": (mesh, "clay")}
+    small = LAMP.replace("radius = 0.3", "radius = 0.15").replace("30, 30, 30", "60, 60, 60")
+    about = "a bar with a lamp beside its end"
+    materials = {"grey": GREY, "clay": CLAY}
+    scene = BounceScene("bar", about, objects, materials, (), (0, 2.0, 3.6), (0, 0.5, 0), more=small)
+    return MovingScene(scene, {"bar": (0, 0.9, 0)}, [("lamp=0.8,0.45,0", "bar=0,0.9,0")])
+
+
 def room(cells: int, detail: int) -> MovingScene:
     """An open box with coloured walls, a panel of light and two blocks that are moved."""
     walls = bounce_scenes._room(cells)

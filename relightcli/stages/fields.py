@@ -24,7 +24,7 @@ from relightcli.core.fields.body import Body
 from relightcli.core.fields.build import RAYS, field_samples
 from relightcli.core.fields.field import shell_radii
 from relightcli.core.fields.lobe_functions import FUNCTIONS
-from relightcli.core.fields.proxies import place_proxies
+from relightcli.core.fields.proxies import POWER, place_proxies
 from relightcli.core.fields.sources import source_field
 from relightcli.core.transport.receivers import Receivers, join_receivers
 from relightcli.core.transport.shading import vertex_colours
@@ -172,6 +172,7 @@ def find_movers(scene: Scene, settings: FieldSettings, cut: bool, seed: int) -> 
             "cut": cut,
             "tolerance": NOISE * scene.tolerance,
             "rays": RAYS,
+            "proxy_power": POWER,
             "seed": seed,
         }
         if by_function:

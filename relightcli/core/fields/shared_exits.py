@@ -26,7 +26,7 @@ from relightcli.core.compress.span import span
 from relightcli.core.fields.body import Body, fill_basis
 from relightcli.core.fields.sampling import Found
 
-LEFT = 2e-3  # a tenth of what the compressed transfer of a glossy object may err by
+LEFT = 3e-3  # in squares a fortieth of what the compressed transfer of a glossy object may err by
 _ROUND_OFF = 3e-7  # of float32 exits: less is nothing
 _LANES = 8  # lights are chosen in groups that fill a vector
 
