@@ -49,7 +49,7 @@ NOISE = 0.5  # of the scene's tolerance: what the self transfer's own noise may 
 @dataclass(frozen=True)
 class FieldSettings:
     """What `--field-*` says. resolution None: by measured error where `spacing` is adaptive; else 16, and 32 for
-    objects with a specular lobe. tolerance None: 0.01, and 0.02 for these."""
+    objects with a specular lobe that is not adjustable. tolerance None: 0.01, and 0.02 for objects with a lobe."""
 
     shells: int = 16
     resolution: int | None = None
