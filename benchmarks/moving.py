@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import shutil
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.interreflections import Picture, error
-from benchmarks.moving_scenes import MAKERS, MovingScene, ball, bar, write
+from benchmarks.moving_scenes import MAKERS, MovingScene, ball, bar, room, write
 from benchmarks.processes import cores
 from benchmarks.report import Report, Row, Table, at_most
 from benchmarks.scenes import Setting
@@ -26,10 +27,11 @@ WHOLE, TWICE, FLIP = 8.0, 15.0, 0.08
 LAYERS = ("", "direct", "one_bounce")
 BASE = {"field_shells": 8, "field_resolution": 8, "field_proxies": 8, "field_order": 4}
 FROM = {"field_shells": 6, "field_resolution": 6, "field_proxies": 4, "field_order": 4}  # where the curves meet
-CURVE: tuple[tuple[str, tuple[int, ...]], ...] = (
-    ("field_order", (4, 6, 8)),
-    ("field_shells", (3, 6, 12)),
-    ("field_proxies", (1, 4, 16)),
+# Each in a scene that it counts in: bands where blocks and walls hide each other, spheres and proxies next to a lamp.
+CURVE: tuple[tuple[Callable[[int, int], MovingScene], str, tuple[int, ...]], ...] = (
+    (room, "field_order", (4, 6, 8)),
+    (bar, "field_shells", (3, 6, 12)),
+    (bar, "field_proxies", (1, 4, 16)),
 )
 
 
@@ -81,36 +83,35 @@ def measure(setting: Setting) -> Report:
 
 
 def _curve(setting: Setting, size: tuple[int, int], spp: int, cells: int, detail: int) -> tuple[Table, list[Row]]:
-    """Error of a bar with a lamp beside its end, in which all of them count, as each setting of its fields grows; and
-    whether it falls."""
-    made = bar(cells, detail)
-    path = write(made, setting.work / "curve", size)
-    sky = _sky(path.parent, False)
+    """Errors as each setting of the fields grows, and whether they fall."""
     rows: list[tuple[str | int | float, ...]] = []
     falling: list[Row] = []
-    refs: list[Picture] = []
-    known: dict[tuple[int, ...], tuple[float, ...]] = {}
-    for key, values in CURVE[:1] if setting.quick else CURVE:
+    known: dict[tuple[str, tuple[int, ...]], tuple[float, ...]] = {}
+    for make, key, values in CURVE[:1] if setting.quick else CURVE:
+        made = make(cells, detail)
+        path = write(made, setting.work / f"curve-{key}", size)
+        sky = _sky(path.parent, made.even)
+        refs: list[Picture] = []
         found = {}
         for value in values[:2] if setting.quick else values:
             fields = {**FROM, key: value}
-            settings = tuple(fields.values())
+            settings = made.scene.name, tuple(fields.values())
             if settings not in known:
-                store, seconds = _store(path, f"{key}-{value}", False, **fields)
+                store, seconds = _store(path, f"{value}", False, **fields)
                 refs = refs or _references(store, sky, made.places[0], 4 * spp)
                 ours, milliseconds = _picture(store, sky, made.places[0])
                 known[settings] = *(error(ours[n], *(r[n] for r in refs)) for n in LAYERS), milliseconds, seconds
                 shutil.rmtree(store)
             found[value] = known[settings]
-            rows.append((key.removeprefix("field_"), value, *known[settings]))
+            rows.append((made.scene.about, key.removeprefix("field_"), value, *known[settings]))
         first, last = min(found), max(found)
         for what, k in (("picture", 0), ("reflected twice", 2)):
             if found[first][k] > 0.0:
                 work = f"{what}: error at {key.removeprefix('field_')} {last}, of that at {first}"
                 falling.append(at_most(work, found[last][k] / found[first][k], "", 1.0))
-    columns = ("knob", "value", "picture, %", "direct, %", "reflected twice, %", "light, ms", "precompute, s")
+    columns = ("scene", "knob", "value", "picture, %", "direct, %", "reflected twice, %", "light, ms", "precompute, s")
     about = ", ".join(f"{key.removeprefix('field_')} {value}" for key, value in FROM.items())
-    return Table(f"{made.scene.about}, as its fields grow; else {about}", columns, tuple(rows)), falling
+    return Table(f"as fields grow; else {about}", columns, tuple(rows)), falling
 
 
 def _suns(setting: Setting, spp: int, cells: int, detail: int) -> tuple[Table, Row]:
