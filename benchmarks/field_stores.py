@@ -40,6 +40,14 @@ specular = [0.6, 0.6, 0.6]
 f0 = 0.6
 roughness = 0.3
 
+[materials.adjustable]
+model = "cook-torrance"
+diffuse = [0.2, 0.2, 0.2]
+specular = [0.6, 0.6, 0.6]
+f0 = 0.6
+roughness = 0.3
+adjustable = true
+
 [cameras.main]
 eye = [0, 1, 4.5]
 target = [0, 1, 0]
@@ -141,9 +149,13 @@ def measure(setting: Setting) -> Report:
         else ()
     )
     vertices = 200 if setting.quick else 5_000
-    for name, material, goal in (("diffuse", "wall", 0.01), ("glossy", "glossy", 0.02)):
-        store = setting.work / f"{name}.zarr"
-        scene = write_one(setting.work / name, material, vertices)
+    for name, material, goal in (
+        ("diffuse", "wall", 0.01),
+        ("glossy", "glossy", 0.02),
+        ("glossy, adjustable", "adjustable", 0.02),
+    ):
+        store = setting.work / f"{material}.zarr"
+        scene = write_one(setting.work / material, material, vertices)
         took, _ = run_tool("precompute", scene, "-o", store, "--effects", "direct,shadows,fields", *small)
         found = inspect(store, verify=False)
         field = found["fields"][0]
