@@ -56,7 +56,7 @@ def measure(setting: Setting) -> Report:
     report = Report(
         "fields of moving objects, compressed to 1 % error: 16 shells of 6 x 16 x 16 samples, 8 proxies, order 4"
     )
-    shells, resolution, rays, proxies = (6, 4, 64, 2) if setting.quick else (16, 16, 1024, 8)
+    shells, resolution, rays, proxies = (6, 4, 64, 2) if setting.quick else (16, 16, 256, 8)
     mesh = lump(2 if setting.quick else 4)
     body = body_of(mesh, MATERIALS["diffuse"])
     field, own = build_field(Tracer(body.positions, body.faces), body, shells, resolution, proxies, rays=rays)

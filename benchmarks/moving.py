@@ -1,13 +1,15 @@
 """Moved objects by their fields against path tracing of the same places, by layer, and as the fields get finer.
 
 Errors are relative RMS over the whole picture, shadow edges and outlines included; the references' noise is not counted
-(`interreflections.error`). Under a small sun they are those of soft and of traced shadows.
+(`interreflections.error`). In one scene the materials of all movers are changed as well. Under a small sun errors are
+those of soft and of traced shadows.
 """
 
 from __future__ import annotations
 
 import shutil
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.interreflections import Picture, error
-from benchmarks.moving_scenes import MAKERS, MovingScene, ball, write
+from benchmarks.moving_scenes import MAKERS, MovingScene, ball, bar, room, write
 from benchmarks.processes import cores
 from benchmarks.report import Report, Row, Table, at_most
 from benchmarks.scenes import Setting
@@ -24,14 +26,13 @@ BOUNCES = 1
 WHOLE, TWICE, FLIP = 8.0, 15.0, 0.08
 LAYERS = ("", "direct", "one_bounce")
 BASE = {"field_shells": 8, "field_resolution": 8, "field_proxies": 8, "field_order": 4}
-CURVE: tuple[tuple[str, tuple[int, ...]], ...] = (
-    ("field_order", (2, 4, 6, 8)),
-    ("field_shells", (2, 4, 8, 16)),
-    ("field_resolution", (4, 8, 16)),
-    ("field_proxies", (1, 2, 4, 8, 16)),
+FROM = {"field_shells": 6, "field_resolution": 6, "field_proxies": 4, "field_order": 4}  # where the curves meet
+# Each in a scene that it counts in: bands where blocks and walls hide each other, spheres and proxies next to a lamp.
+CURVE: tuple[tuple[Callable[[int, int], MovingScene], str, tuple[int, ...]], ...] = (
+    (room, "field_order", (4, 6, 8)),
+    (bar, "field_shells", (3, 6, 12)),
+    (bar, "field_proxies", (1, 4, 16)),
 )
-
-FALLING_FROM = {"field_order": 4}  # fewer bands are no default of anything
 
 
 def measure(setting: Setting) -> Report:
@@ -55,8 +56,9 @@ def measure(setting: Setting) -> Report:
         worst = dict.fromkeys(LAYERS, 0.0)
         most = 0.0
         for moves in made.places[:1] if setting.quick else made.places:
-            ours, milliseconds = _picture(store, sky, moves)
-            refs = _references(store, sky, moves, spp)
+            edit = made.scene.edit
+            ours, milliseconds = _picture(store, sky, moves, settings=edit)
+            refs = _references(store, sky, moves, spp, settings=edit)
             errors = {name: error(ours[name], *(r[name] for r in refs)) for name in LAYERS}
             flip = float(flip_hdr(ours[""], 0.5 * (refs[0][""] + refs[1][""])).mean())
             worst = {name: max(worst[name], errors[name]) for name in LAYERS}
@@ -74,55 +76,53 @@ def measure(setting: Setting) -> Report:
     curve, falling = _curve(setting, size, spp, cells, detail)
     report.rows += falling
     report.tables.append(curve)
-    report.tables.append(_suns(setting, size, spp, cells, detail))
+    suns, row = _suns(setting, spp, cells, detail)
+    report.rows.append(row)
+    report.tables.append(suns)
     return report
 
 
 def _curve(setting: Setting, size: tuple[int, int], spp: int, cells: int, detail: int) -> tuple[Table, list[Row]]:
-    """Error of the ball, close to the floor and next to a lamp, as each setting of its fields grows; and whether it
-    falls."""
-    from benchmarks.moving_scenes import lamp
-
-    made = lamp(cells, detail)
-    made.places = [("lamp=-0.2,1.6,0.6", "ball=0,0.7,0")]
-    path = write(made, setting.work / "curve", size)
-    sky = _sky(path.parent, False)
+    """Errors as each setting of the fields grows, and whether they fall."""
     rows: list[tuple[str | int | float, ...]] = []
     falling: list[Row] = []
-    refs: list[Picture] = []
-    known: dict[tuple[int, ...], tuple[float, ...]] = {}
-    for key, values in CURVE[:1] if setting.quick else CURVE:
+    known: dict[tuple[str, tuple[int, ...]], tuple[float, ...]] = {}
+    for make, key, values in CURVE[:1] if setting.quick else CURVE:
+        made = make(cells, detail)
+        path = write(made, setting.work / f"curve-{key}", size)
+        sky = _sky(path.parent, made.even)
+        refs: list[Picture] = []
         found = {}
         for value in values[:2] if setting.quick else values:
-            fields = {**BASE, key: value}
-            settings = tuple(fields.values())
+            fields = {**FROM, key: value}
+            settings = made.scene.name, tuple(fields.values())
             if settings not in known:
-                store, seconds = _store(path, f"{key}-{value}", False, **fields)
+                store, seconds = _store(path, f"{value}", False, **fields)
                 refs = refs or _references(store, sky, made.places[0], 4 * spp)
                 ours, milliseconds = _picture(store, sky, made.places[0])
                 known[settings] = *(error(ours[n], *(r[n] for r in refs)) for n in LAYERS), milliseconds, seconds
                 shutil.rmtree(store)
             found[value] = known[settings]
-            rows.append((key.removeprefix("field_"), value, *known[settings]))
-        first, last = max(min(found), FALLING_FROM.get(key, 0)), max(found)
+            rows.append((made.scene.about, key.removeprefix("field_"), value, *known[settings]))
+        first, last = min(found), max(found)
         for what, k in (("picture", 0), ("reflected twice", 2)):
-            if first in found and found[first][k] > 0.0:
+            if found[first][k] > 0.0:
                 work = f"{what}: error at {key.removeprefix('field_')} {last}, of that at {first}"
                 falling.append(at_most(work, found[last][k] / found[first][k], "", 1.0))
-    columns = ("knob", "value", "picture, %", "direct, %", "reflected twice, %", "light, ms", "precompute, s")
-    return Table("a ball, a floor and a lamp close by, as its fields grow", columns, tuple(rows)), falling
+    columns = ("scene", "knob", "value", "picture, %", "direct, %", "reflected twice, %", "light, ms", "precompute, s")
+    about = ", ".join(f"{key.removeprefix('field_')} {value}" for key, value in FROM.items())
+    return Table(f"as fields grow; else {about}", columns, tuple(rows)), falling
 
 
-def _suns(setting: Setting, size: tuple[int, int], spp: int, cells: int, detail: int) -> Table:
-    """Soft and traced shadows of the sun."""
+def _suns(setting: Setting, spp: int, cells: int, detail: int) -> tuple[Table, Row]:
+    """Soft and traced shadows of the sun, and the largest error with traced ones."""
     from relightcli.adapters.images import write_image
     from relightcli.core.lights.sky import sky_latlong
 
     made: MovingScene = ball(cells, detail)
-    path = write(made, setting.work / "suns", size)
-    sky = path.parent / "sun.exr"
+    store = setting.work / ball.__name__ / "store.zarr"  # of the first scene
+    sky = store.parent / "sun.exr"
     write_image(sky, sky_latlong(40.0, 150.0))
-    store, _ = _store(path, "store", False, **BASE)
     rows: list[tuple[str | int | float, ...]] = []
     for moves in made.places[1:2] if setting.quick else made.places[1::2]:
         refs = _references(store, sky, moves, spp)
@@ -130,7 +130,9 @@ def _suns(setting: Setting, size: tuple[int, int], spp: int, cells: int, detail:
             ours, milliseconds = _picture(store, sky, moves, suns=suns)
             rows.append((moves[0], suns, *(error(ours[n], *(r[n] for r in refs)) for n in LAYERS), milliseconds))
     columns = ("place", "--suns", "picture, %", "direct, %", "reflected twice, %", "light, ms")
-    return Table("a ball over a plane in the sun", columns, tuple(rows))
+    worst = max(float(row[2]) for row in rows if row[1] == "traced")
+    judged = at_most(f"{made.scene.about} in the sun, its shadows traced: picture", worst, "%", WHOLE)
+    return Table("a ball over a plane in the sun", columns, tuple(rows)), judged
 
 
 def _sky(folder: Path, even: bool) -> Path:
@@ -176,7 +178,7 @@ def _picture(store: Path, sky: Path, moves: tuple[str, ...], **more: Any) -> tup
     return _read(output), 1e3 * again["lighting_seconds"]
 
 
-def _references(store: Path, sky: Path, moves: tuple[str, ...], spp: int) -> list[Picture]:
+def _references(store: Path, sky: Path, moves: tuple[str, ...], spp: int, **more: Any) -> list[Picture]:
     """Two that do not know of each other."""
     from relightcli.stages.relight import Config, relight
 
@@ -196,6 +198,7 @@ def _references(store: Path, sky: Path, moves: tuple[str, ...], spp: int) -> lis
                 workers=cores(),
                 overwrite=True,
                 quiet=True,
+                **more,
             )
         )
         out.append(_read(output))

@@ -75,6 +75,17 @@ def lamp(cells: int, detail: int) -> MovingScene:
     return made
 
 
+def bar(cells: int, detail: int) -> MovingScene:
+    """A bar over a floor, with a lamp between them beside its end: light differs along it, and from below."""
+    mesh = _centered(rounded((1.6, 0.3, 0.3), power=8, subdivisions=detail))
+    objects = {"floor": (_floor(2 * cells, 2.0), "grey"), "bar": (mesh, "clay")}
+    small = LAMP.replace("radius = 0.3", "radius = 0.15").replace("30, 30, 30", "60, 60, 60")
+    about = "a bar with a lamp beside its end"
+    materials = {"grey": GREY, "clay": CLAY}
+    scene = BounceScene("bar", about, objects, materials, (), (0, 2.0, 3.6), (0, 0.5, 0), more=small)
+    return MovingScene(scene, {"bar": (0, 0.9, 0)}, [("lamp=0.8,0.45,0", "bar=0,0.9,0")])
+
+
 def room(cells: int, detail: int) -> MovingScene:
     """An open box with coloured walls, a panel of light and two blocks that are moved."""
     walls = bounce_scenes._room(cells)
@@ -139,4 +150,34 @@ def chess(cells: int, detail: int) -> MovingScene | None:
     return MovingScene(scene, at, places, coarse=True)
 
 
-MAKERS: tuple[Callable[[int, int], MovingScene | None], ...] = (ball, lamp, room, bricks, chess)
+def edited(cells: int, detail: int) -> MovingScene:
+    """Two glossy movers and a matte one, whose materials are all changed after the simulation."""
+    objects: dict[str, tuple[Mesh, str]] = {
+        "floor": (_floor(2 * cells), "grey"),
+        "ball": (_ball(detail), "brass"),
+        "block": (_centered(rounded((0.9, 0.9, 0.9), power=8, subdivisions=detail)), "lacquer"),
+        "egg": (_centered(rounded((0.6, 0.8, 0.6), power=2, subdivisions=detail)), "paint"),
+    }
+    metal = 'model = "cook-torrance"\ndiffuse = {}\nspecular = {}\nf0 = {}\nroughness = {}\nadjustable = true'
+    materials = {
+        "grey": GREY,
+        "brass": metal.format("[0.1, 0.1, 0.1]", "[0.8, 0.7, 0.5]", 0.6, 0.2),
+        "lacquer": metal.format("[0.6, 0.5, 0.4]", "[0.1, 0.1, 0.1]", 0.2, 0.6),
+        "paint": "diffuse = [0.7, 0.2, 0.2]\nadjustable = true",
+    }
+    edit = (
+        *("brass.diffuse=0.6,0.2,0.1", "brass.specular=0.1,0.1,0.1", "brass.f0=0.3", "brass.roughness=0.5"),
+        *("lacquer.diffuse=0.05,0.05,0.05", "lacquer.specular=0.9,0.8,0.6", "lacquer.f0=0.8", "lacquer.roughness=0.4"),
+        "paint.diffuse=0.1,0.3,0.8",
+    )
+    about = "three movers, all of their materials changed"
+    scene = BounceScene("edited", about, objects, materials, edit, (0, 2.5, 4.5), (0, 0.5, 0))
+    at = {"ball": (0.0, 0.6, 0.5), "block": (-1.2, 0.5, 0.0), "egg": (1.2, 0.45, 0.0)}
+    places = [
+        ("ball=0.1,0.52,0.4", "block=-0.85,0.46,0,0,20,0", "egg=0.3,0.42,-0.45"),
+        ("ball=0,0.7,0", "block=0.9,0.8,0.3,30,20,0", "egg=-0.75,0.42,0.2,0,0,40"),
+    ]
+    return MovingScene(scene, at, places)
+
+
+MAKERS: tuple[Callable[[int, int], MovingScene | None], ...] = (ball, lamp, room, bricks, chess, edited)

@@ -146,7 +146,7 @@ def places():
     ROUNDINGS + " of differences of coordinates",
 )
 def proxies():
-    from relightcli.core.fields.proxies import proxy_weights
+    from relightcli.core.fields.proxies import POWER, proxy_weights
 
     errors = []
     for scale in (1.0, 2.0**-20):
@@ -154,7 +154,7 @@ def proxies():
         points = np.array([[1e-5, 0, 0], [0.3, 0.3, 0.1], [1e4, 2e4, 1e3]]) * scale
         found = proxy_weights(points, chi, scale)
         for p, row in zip(points, found, strict=True):
-            inverse = [1 / norm(mpf(p) - mpf(c)) for c in chi]
+            inverse = [1 / norm(mpf(p) - mpf(c)) ** POWER for c in chi]
             errors.append(relative(row, numbers(w / mp.fsum(inverse) for w in inverse)))
     return np.stack(errors)
 

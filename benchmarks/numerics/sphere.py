@@ -79,7 +79,7 @@ def cells():
     "order 10; anywhere, and within 1e-8 of the poles",
     "float64",
     2.6,
-    "sphericart's constants of the bands 3 to 6 have 14 digits; relative to the largest value of the band",
+    "differences of the bands below, nine times over; relative to the largest value of the band",
 )
 def values():
     from relightcli.core.sphere import sh

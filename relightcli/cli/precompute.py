@@ -84,7 +84,7 @@ from relightcli.cli import options
     "--field-resolution",
     default=None,
     type=int,
-    help="Directions along a cube face on every sphere. Default: 16, and 32 for objects with a specular lobe.",
+    help="Directions along a cube face on every sphere. Default: 16, and 32 for objects with a fixed specular lobe.",
 )
 @click.option("--field-proxies", default=8, show_default=True, help="Points of an object that take its light, at most.")
 @click.option("--field-order", default=4, show_default=True, help="Bands of the spherical harmonics of fields.")

@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 
 import relight_formats as formats
 from relightcli.adapters.rays import Tracer
+from relightcli.core.brdf.models import MODEL_CODES
 from relightcli.core.fields.body import Body
-from relightcli.core.fields.build import field_samples
+from relightcli.core.fields.build import Exits, field_samples, short
 from relightcli.core.fields.compression import compress
+from relightcli.core.fields.lobe_functions import FUNCTIONS, exits_by_function
 from relightcli.core.fields.self_transfer import exits_of, solve
 from relightcli.run import blocks as run
 from relightcli.scene.model import Material
@@ -37,8 +39,9 @@ OF_WHOLE = 0.5  # of the transfer's tolerance: the error of a glossy object's se
 
 @dataclass(frozen=True)
 class FieldSpec:
-    """One field to simulate: where it lies and how. `colours` and `points` are those of its body; tolerance of its self
-    transfer, transfer_tolerance of the compression."""
+    """One field to simulate: where it lies and how. `colours` and `points` are those of its body; by_function: what it
+    sends is simulated for the functions of a lobe in the place of colours; tolerance of its self transfer,
+    transfer_tolerance of the compression."""
 
     prefix: str
     material: Material
@@ -48,6 +51,7 @@ class FieldSpec:
     resolution: int
     proxies: int
     colours: int
+    by_function: bool
     points: int
     rays: int
     tolerance: float
@@ -60,9 +64,14 @@ class FieldSpec:
         return 6 * self.resolution * self.resolution
 
     @property
+    def sent(self) -> int:
+        """Colours or functions of what it sends."""
+        return 1 + FUNCTIONS if self.by_function else self.colours
+
+    @property
     def block(self) -> int:
         """Samples in a block, which is a chunk: of one shell, about CHUNK_BYTES of transfer."""
-        sample = 4 * self.proxies * self.order**4 * self.colours
+        sample = 4 * self.proxies * self.order**4 * self.sent
         return max(1, min(self.cells, CHUNK_BYTES // sample))
 
     @property
@@ -118,7 +127,7 @@ class SampleWorker:
         self.first = [0]
         for spec in job.fields:
             self.first.append(self.first[-1] + spec.shells * spec.cells)
-        self.opened: tuple[int, Body, Tracer, NDArray[np.float32], NDArray[np.float64]] | None = None
+        self.opened: tuple[int, Body, Tracer, Exits, NDArray[np.float64]] | None = None
 
     def run(self, block: run.Block) -> run.Info:
         k = bisect.bisect_right(self.first, block.start) - 1
@@ -128,7 +137,9 @@ class SampleWorker:
             body, tracer = open_body(self.job.partial, spec)
             transfer: Any = formats.worker_array(self.job.partial, f"{spec.prefix}{WORK}/self")[...]
             radii: Any = formats.worker_array(self.job.partial, f"{spec.prefix}radii")[:]
-            self.opened = k, body, tracer, exits_of(body, transfer), radii
+            proxies: Any = formats.worker_array(self.job.partial, f"{spec.prefix}proxies")[:]
+            texture: Any = formats.worker_array(self.job.partial, f"{spec.prefix}mesh/texture")[...]
+            self.opened = k, body, tracer, what_is_sent(spec, body, transfer, texture, proxies), radii
         _, body, tracer, exits, radii = self.opened
         start, stop = block.start - self.first[k], block.stop - self.first[k]
         found = field_samples(tracer, body, exits, radii, spec.resolution, start, stop, rays=spec.rays, seed=spec.seed)
@@ -225,6 +236,20 @@ def open_body(partial: str, spec: FieldSpec) -> tuple[Body, Tracer]:
     return body, Tracer(body.positions, body.faces)
 
 
+def what_is_sent(
+    spec: FieldSpec,
+    body: Body,
+    transfer: NDArray[np.float32],
+    texture: NDArray[np.float32],
+    proxies: NDArray[np.float64],
+) -> Exits:
+    """Exit radiance of a field's body with this self transfer, in the form that its samples take; texture (V, 3)."""
+    if spec.by_function:
+        grey = texture[body.vertex].mean(axis=1)
+        return exits_by_function(body, MODEL_CODES[spec.material.model], transfer, grey, proxies)
+    return short(body, exits_of(body, transfer), proxies)
+
+
 def make_room(writer: formats.Writer, spec: FieldSpec) -> None:
     """The arrays that the blocks of a field fill, unless they are all done."""
     shape, chunks, p, n = (spec.shells, spec.cells), (1, spec.block), spec.prefix, spec.order**2
@@ -238,7 +263,7 @@ def make_room(writer: formats.Writer, spec: FieldSpec) -> None:
         ("self", (spec.points,), (rows,), size, ("point", *matrix)),
         ("by_order", (spec.points,), (rows,), (n, 1 + 2 * spec.colours), ("point", "harmonic", "part")),
         ("occlusion", shape, chunks, (n,), ("shell", "direction", "harmonic")),
-        ("transfer", shape, chunks, size, ("shell", "direction", *matrix)),
+        ("transfer", shape, chunks, (*size[:-1], spec.sent), ("shell", "direction", *matrix[:-1], "sent_colour")),
     ):
         writer.array(
             f"{p}{WORK}/{name}",

@@ -23,7 +23,8 @@ from relightcli.core.fields.albedos import NODES
 from relightcli.core.fields.body import Body
 from relightcli.core.fields.build import RAYS, field_samples
 from relightcli.core.fields.field import shell_radii
-from relightcli.core.fields.proxies import place_proxies
+from relightcli.core.fields.lobe_functions import FUNCTIONS
+from relightcli.core.fields.proxies import POWER, place_proxies
 from relightcli.core.fields.sources import source_field
 from relightcli.core.transport.receivers import Receivers, join_receivers
 from relightcli.core.transport.shading import vertex_colours
@@ -32,7 +33,7 @@ from relightcli.scene.bodies import OwnMesh, own_mesh, put_meshes, vertex_number
 from relightcli.scene.materials import table_from_material
 from relightcli.scene.model import Geometry, Scene
 from relightcli.stages.bodies import body_of
-from relightcli.stages.field_job import FieldSpec, simulate
+from relightcli.stages.field_job import FieldSpec, simulate, what_is_sent
 from relightcli.stages.field_store import copy_field, put_body, put_source
 
 KIND = "field"
@@ -48,7 +49,7 @@ NOISE = 0.5  # of the scene's tolerance: what the self transfer's own noise may 
 @dataclass(frozen=True)
 class FieldSettings:
     """What `--field-*` says. resolution None: by measured error where `spacing` is adaptive; else 16, and 32 for
-    objects with a specular lobe. tolerance None: 0.01, and 0.02 for these."""
+    objects with a specular lobe that is not adjustable. tolerance None: 0.01, and 0.02 for objects with a lobe."""
 
     shells: int = 16
     resolution: int | None = None
@@ -101,12 +102,13 @@ class FieldSettings:
 @dataclass(frozen=True)
 class Mover:
     """One rigid object: its mesh in its own frame, the body, the number of its field, and whether that holds for any
-    albedo (`core.fields.albedos`)."""
+    albedo (`core.fields.albedos`) or is one of functions of its lobe (`core.fields.lobe_functions`)."""
 
     mesh: OwnMesh
     body: Body
     field: int
     any_albedo: bool
+    by_function: bool
 
 
 @dataclass(frozen=True)
@@ -156,6 +158,7 @@ def find_movers(scene: Scene, settings: FieldSettings, cut: bool, seed: int) -> 
         if any_albedo:
             material = replace(material, diffuse=NODES)
         body = body_of(own.positions, own.normals, own.faces, spec.two_sided, texture, material, settings.order)
+        by_function = material.adjustable and body.terms > 1
         files = [spec.mesh, *buffer_files(spec.mesh)]
         if material.diffuse_texture is not None:
             files.append(material.diffuse_texture)
@@ -169,13 +172,16 @@ def find_movers(scene: Scene, settings: FieldSettings, cut: bool, seed: int) -> 
             "cut": cut,
             "tolerance": NOISE * scene.tolerance,
             "rays": RAYS,
+            "proxy_power": POWER,
             "seed": seed,
         }
+        if by_function:
+            made["functions"] = FUNCTIONS
         key = formats.fingerprint_json({"settings": made, "inputs": inputs})
         if key not in known:
             known[key] = len(fields)
             proxies = place_proxies(body.point, settings.proxies, seed)
-            radii, resolution = _samples(body, settings, seed)
+            radii, resolution = _samples(body, settings, seed, by_function)
             field = FieldSpec(
                 f"fields/{len(fields)}/",
                 material,
@@ -185,6 +191,7 @@ def find_movers(scene: Scene, settings: FieldSettings, cut: bool, seed: int) -> 
                 resolution,
                 len(proxies),
                 body.colours,
+                by_function,
                 len(body.point),
                 RAYS,
                 NOISE * scene.tolerance,
@@ -192,13 +199,14 @@ def find_movers(scene: Scene, settings: FieldSettings, cut: bool, seed: int) -> 
                 seed,
             )
             fields.append(Distinct(field, body, texture, radii, proxies, made, inputs))
-        movers.append(Mover(mesh, body, known[key], any_albedo))
+        movers.append(Mover(mesh, body, known[key], any_albedo, by_function))
     return Moving(tuple(movers), tuple(fields))
 
 
-def _samples(body: Body, settings: FieldSettings, seed: int) -> tuple[NDArray[np.float64], int]:
-    """Radii of the shells, and directions along a cube face."""
-    resolution = settings.resolution_of(body.terms > 1)
+def _samples(body: Body, settings: FieldSettings, seed: int, by_function: bool) -> tuple[NDArray[np.float64], int]:
+    """Radii of the shells, and directions along a cube face: of fields of functions, of which there are five in one,
+    no more than of diffuse ones."""
+    resolution = settings.resolution_of(body.terms > 1 and not by_function)
     if settings.spacing != "adaptive":
         return shell_radii(body.radius, settings.shells, settings.spacing), resolution
     tracer = Tracer(body.positions, body.faces)
@@ -250,7 +258,8 @@ def describe(moving: Moving, scene: Scene, starts: tuple[int, ...], first_source
     """The attribute `fields` of the store.
 
     objects: name to the number of its field, its first receiver and their number, its placement (4, 4), own frame to
-    world, and whether the field holds for any albedo; lights: name to the number of its source field, under `sources/`.
+    world, whether the field holds for any albedo, or is one of functions of a lobe; lights: name to the number of its
+    source field, under `sources/`.
     """
     objects = {
         mover.mesh.name: {
@@ -259,6 +268,7 @@ def describe(moving: Moving, scene: Scene, starts: tuple[int, ...], first_source
             "count": len(mover.body.point),
             "placement": mover.mesh.placement.tolist(),
             "any_albedo": mover.any_albedo,
+            "by_function": mover.by_function,
         }
         for i, mover in enumerate(moving.movers)
     }
@@ -297,8 +307,9 @@ def predict(moving: Moving) -> tuple[float, float, float]:
     for field in moving.fields:
         spec, body = field.spec, field.body
         tracer = Tracer(body.positions, body.faces)
-        lights = spec.proxies * spec.order**2 * spec.colours
-        dark = np.zeros((spec.points, body.terms, lights), np.float32)
+        n = spec.order**2
+        nothing = np.zeros((spec.points, spec.proxies, n, n, spec.colours), np.float32)
+        dark = what_is_sent(spec, body, nothing, field.texture, field.proxies)
         for _ in range(2):  # the first run pays for compilation
             clock = time.perf_counter()
             for shell in np.linspace(0, spec.shells - 1, PILOT_SHELLS).astype(int):
@@ -310,7 +321,7 @@ def predict(moving: Moving) -> tuple[float, float, float]:
         samples = spec.shells * spec.cells
         seconds += taken * samples / (PILOT_SHELLS * min(PILOT, spec.cells))
         rays += float(samples * spec.rays)
-        size += 4.0 * samples * spec.order**2 * lights / RATIO
+        size += 4.0 * samples * spec.proxies * n * n * spec.sent / RATIO
     return rays, seconds, size
 
 

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 import relight_formats as formats
 from relightcli.adapters.rays import Tracer
 from relightcli.core.brdf.models import MODEL_CODES, SPECULAR, pack_materials
-from relightcli.core.fields.albedos import Scaled, reflectance, self_weights, transfer_at
+from relightcli.core.fields.albedos import mixed, self_weights, transfer_at
 from relightcli.core.fields.body import Body, axes
 from relightcli.core.fields.entities import Entity, Surroundings, of_light
 from relightcli.core.fields.interpolate import make_grid
+from relightcli.core.fields.lobe_functions import function_weights, lobe_functions
 from relightcli.core.fields.shade import Receivers
 from relightcli.core.fields.sites import Between, between, outlook, spread_out
 from relightcli.core.shade.low_order import response
@@ -35,10 +36,10 @@ SIMILAR = 1e-6  # relative, by which a placement may differ from a rotation and 
 @dataclass(frozen=True)
 class Mover:
     """One object that may be moved. rows: its receivers; placement (4, 4): from its field's frame to where the scene
-    has it; kept: the field, if the material may be changed; any_albedo: whether it holds for all of them; stored: the
-    material that it was simulated with, texture (3,) the mean of what is multiplied to its diffuse colour; made_for:
-    that of `body`, `own`, `receivers` and `colour`; sites (S, 3) on it in the field's frame, after its proxies; spread:
-    how its points take light from those."""
+    has it; kept: the field, if the material may be changed; any_albedo: whether it holds for all of them; functions: of
+    the lobe, that it was simulated for (`core.fields.lobe_functions`), None if it was not; texture (3,): the mean of
+    what is multiplied to its diffuse colour; made_for: the material of `body`, `own`, `receivers` and `colour`; sites
+    (S, 3) on it in the field's frame, after its proxies; spread: how its points take light from those."""
 
     name: str
     rows: slice
@@ -46,7 +47,7 @@ class Mover:
     material: str
     kept: KeptField | None
     any_albedo: bool
-    stored: Material
+    functions: F32 | None
     texture: F64
     made_for: Material
     body: Body
@@ -65,8 +66,8 @@ class Mover:
         """With another material. Raises InputError for what its field does not hold for."""
         if material == self.made_for:
             return self
-        if self.kept is not None and not self.any_albedo:
-            return self._coated(self.kept, material)
+        if self.kept is not None and self.functions is not None:
+            return self._coated(self.kept, self.functions, material)
         if self.kept is None or replace(material, diffuse=self.made_for.diffuse) != self.made_for:
             raise InputError(
                 f"--set {self.material}: is the material of {self.name!r}, which moves: of its fields, only the "
@@ -77,22 +78,18 @@ class Mover:
         receivers = _receivers(self.body, self.kept, material, any_albedo=True)
         return replace(self, made_for=material, own=own, receivers=receivers)
 
-    def _coated(self, kept: KeptField, material: Material) -> Mover:
+    def _coated(self, kept: KeptField, functions: F32, material: Material) -> Mover:
         """With another material in the place of one with a specular lobe."""
         row = pack_materials([material]).parameters[0]
         lobe = self.body.lobe  # of a material without one: in no colour
         if any(material.specular):
             lobe = response(MODEL_CODES[material.model], row, self.body.order)
-        was = pack_materials([self.stored])
-        before = response(int(was.model[0]), was.parameters[0], self.body.order)
-        rho = reflectance(self.texture * material.diffuse, row[SPECULAR : SPECULAR + 3], lobe)
-        rho_before = reflectance(self.texture * self.stored.diffuse, was.parameters[0, SPECULAR : SPECULAR + 3], before)
-        factor = np.divide(rho, rho_before, out=np.zeros(3), where=rho_before > 0.0)
+        weights = function_weights(functions, lobe, _sent(material, self.texture), row[SPECULAR : SPECULAR + 3])
         return replace(
             self,
             made_for=material,
             body=self.body._replace(lobe=lobe),
-            own=replace(self.own, transfer=Scaled(kept.transfer, factor.astype(np.float32))),
+            own=replace(self.own, transfer=mixed(kept.transfer, weights)),
             receivers=_dyed(self.receivers, kept.self_by_order, material),
             colour=row[SPECULAR : SPECULAR + 3].astype(np.float32),
         )
@@ -123,11 +120,12 @@ def field_order(store: formats.Store) -> int:
 def read_movers(store: formats.Store, scene_materials: dict[str, Material], objects: dict[str, Any]) -> list[Mover]:
     """Everything that the store has fields of; objects: the scene's, by name."""
     order = field_order(store)
-    parts: dict[tuple[int, str, bool, bool], tuple[Any, ...]] = {}
+    parts: dict[tuple[int, str, bool, bool, bool], tuple[Any, ...]] = {}
     movers = []
     for name, about in store.attrs["fields"]["objects"].items():
         spec = objects[name]
-        key = int(about["field"]), str(spec.material), bool(spec.two_sided), bool(about["any_albedo"])
+        kinds = bool(about["any_albedo"]), bool(about.get("by_function"))  # which earlier stores have not
+        key = int(about["field"]), str(spec.material), bool(spec.two_sided), *kinds
         if key not in parts:
             parts[key] = _read_object(store, key, scene_materials[spec.material], order)
         rows = slice(int(about["first"]), int(about["first"]) + int(about["count"]))
@@ -136,7 +134,7 @@ def read_movers(store: formats.Store, scene_materials: dict[str, Material], obje
 
 
 def _read_object(
-    store: formats.Store, key: tuple[int, str, bool, bool], material: Material, order: int
+    store: formats.Store, key: tuple[int, str, bool, bool, bool], material: Material, order: int
 ) -> tuple[Any, ...]:
     """The parts of a mover from `kept` on."""
     prefix = f"fields/{key[0]}/"
@@ -144,7 +142,15 @@ def _read_object(
     position, face = read(f"{prefix}mesh/position"), read(f"{prefix}mesh/face")
     texture = read(f"{prefix}mesh/texture")
     body = body_of(position, read(f"{prefix}mesh/normal"), face, key[2], texture, material, order)
-    kept, any_albedo = read_field(store, prefix), key[3]
+    kept, any_albedo, by_function = read_field(store, prefix), key[3], key[4]
+    mean = np.asarray(texture, np.float64)[body.vertex].mean(axis=0)
+    colour = pack_materials([material]).parameters[0, SPECULAR : SPECULAR + 3].astype(np.float32)
+    transfer, functions = kept.transfer, None
+    if any_albedo:
+        transfer = transfer_at(transfer, material.diffuse)
+    elif by_function:
+        functions = lobe_functions(MODEL_CODES[material.model], order)
+        transfer = mixed(transfer, function_weights(functions, body.lobe, _sent(material, mean), colour))
     used = position[np.unique(face)]
     own = Surroundings(
         make_grid(kept.radii, kept.resolution, kept.valid),
@@ -152,21 +158,19 @@ def _read_object(
         np.stack([used.min(axis=0), used.max(axis=0)]),
         body.radius,
         kept.occlusion,
-        transfer_at(kept.transfer, material.diffuse) if any_albedo else kept.transfer,
+        transfer,
         None,
         kept.proxies,
     )
-    colour = pack_materials([material]).parameters[0, SPECULAR : SPECULAR + 3].astype(np.float32)
     outlooks = outlook(body.point, body.normal, body.radius)
     chosen = spread_out(outlooks, SITES)
     on_surface = body.point[chosen]
     sites = np.concatenate([kept.proxies, on_surface + INWARDS * (body.center - on_surface)])
-    coated = material.adjustable and body.terms > 1
     return (
-        kept if any_albedo or coated else None,
+        kept if any_albedo or by_function else None,
         any_albedo,
-        material,
-        np.asarray(texture, np.float64)[body.vertex].mean(axis=0),
+        functions,
+        mean,
         material,
         body,
         own,
@@ -176,6 +180,13 @@ def _read_object(
         sites,
         between(outlooks, outlooks[chosen]),
     )
+
+
+def _sent(material: Material, texture: F64) -> F64:
+    """Diffuse colour (3,) of what is sent beside a texture in grey; texture (3,): its mean."""
+    grey = float(texture.mean())
+    out: F64 = np.array(material.diffuse) * (texture / grey if grey > 0.0 else 0.0)
+    return out
 
 
 def _receivers(body: Body, kept: KeptField, material: Material, any_albedo: bool) -> Receivers:

@@ -43,7 +43,7 @@ def grid(size, cells, albedo):
     return Part(corners, triangles, np.tile([0.0, 1.0, 0.0], (len(corners), 1)), material=lambert(albedo))
 
 
-def block(albedo):
+def block_of(albedo):
     """A cube of edge 1 with sharp edges."""
     mesh = trimesh.creation.box((1, 1, 1)).subdivide().subdivide().subdivide()
     corners = mesh.vertices[mesh.faces].reshape(-1, 3)
@@ -61,7 +61,7 @@ def smooth_sky():
 
 def write(folder, albedo=(0.5, 0.7, 0.7), more="", **parts):
     parts = {"ground": grid(6, 48, albedo[0]), "ball": sphere(0.5, rings=10, material=lambert(albedo[1])), **parts}
-    parts.setdefault("block", block(albedo[2]))
+    parts.setdefault("block", block_of(albedo[2]))
     maps = {"smooth": smooth_sky(), "even": np.ones((4, 8, 3))}
     path = write_scene(folder, parts, [CAMERA], maps, more=more)
     text = path.read_text()
@@ -270,25 +270,36 @@ def test_the_diffuse_colour_of_what_moves_may_change(tmp_path, library):
         picture(made, env="smooth", settings=("ball=brass",))
 
 
-def test_the_specular_material_of_what_moves_may_change(tmp_path, library):
-    """As if the scene file had said so, for a ball that does not see itself: its own points within the error of the
-    compressed self transfer, 1 %. What it sends on is right in its amount alone, which leaves 1 % of this layer."""
-    names = ("cook-torrance", (0.1, 0.1, 0.1), (0.4, 0.4, 0.4))
-    path = write(tmp_path, ball=sphere(0.5, rings=10, material=Material("m", *names, f0=0.6, roughness=0.3)))
+def test_the_materials_of_several_movers_may_change(tmp_path, library):
+    """As if the scene file had said so, for a ball and a block that do not see themselves: their own points within the
+    error of the compressed self transfer, 1 %; what they send within those of both compressed fields, 2 % each, and
+    what four functions leave of a lobe. Against path tracing: `benchmarks moving`."""
+
+    def materials(ball, block):
+        parts = {"ball": sphere(0.5, rings=10), "block": block_of(0.5)}
+        for name, values in (("ball", ball), ("block", block)):
+            diffuse, specular, f0, roughness = values
+            parts[name].material = Material("m", "cook-torrance", diffuse, specular, f0=f0, roughness=roughness)
+        return parts
+
+    old = ((0.1, 0.1, 0.1), (0.8, 0.7, 0.5), 0.6, 0.3), ((0.6, 0.5, 0.4), (0.1, 0.1, 0.1), 0.2, 0.6)
+    new = ((0.6, 0.2, 0.1), (0.1, 0.1, 0.1), 0.3, 0.6), ((0.05, 0.05, 0.05), (0.9, 0.8, 0.6), 0.8, 0.4)
+    path = write(tmp_path, **materials(*old))
     path.write_text(path.read_text().replace("adjustable = false", "adjustable = true"))
     made = make_store(path, **SMALL, bounces=1, field_library=library)
-    settings = ("ball.specular=0.9,0.6,0.2", "ball.roughness=0.5", "ball.f0=0.9", "ball.diffuse=0.05,0.2,0.1")
+    settings = []
+    for name, (diffuse, specular, f0, roughness) in zip(("ball", "block"), new, strict=True):
+        settings += [f"{name}.{k}={','.join(map(str, v))}" for k, v in (("diffuse", diffuse), ("specular", specular))]
+        settings += [f"{name}.f0={f0}", f"{name}.roughness={roughness}"]
     moves = ("ball=0.1,0.5,0.4", "block=-0.8,0.5,0,0,20,0")
     before = layers(made, "before", moves)
-    ours = layers(made, "ours", moves, settings=settings)
-    text = path.read_text().replace("specular = [0.4, 0.4, 0.4]", "specular = [0.9, 0.6, 0.2]")
-    text = text.replace("diffuse = [0.1, 0.1, 0.1]", "diffuse = [0.05, 0.2, 0.1]")
-    path.write_text(text.replace("f0 = 0.6", "f0 = 0.9").replace("roughness = 0.3", "roughness = 0.5"))
-    anew = layers(make_store(path, "anew.zarr", **SMALL, bounces=1, field_library=library), "anew", moves)
+    ours = layers(made, "ours", moves, settings=tuple(settings))
+    anew = write(tmp_path / "anew", **materials(*new))
+    anew = layers(make_store(anew, **SMALL, bounces=1, field_library=library), "anew", moves)
     for name, bound in (("direct", 1e-5), ("specular", 0.01), ("one_bounce", 0.03)):
         missing = np.sqrt(((ours[name] - anew[name]) ** 2).mean() / (anew[name] ** 2).mean())
         assert missing < bound, name
-        assert np.sqrt(((before[name] - anew[name]) ** 2).mean() / (anew[name] ** 2).mean()) > 2 * bound, name
+        assert np.sqrt(((before[name] - anew[name]) ** 2).mean() / (anew[name] ** 2).mean()) > 5 * bound, name
 
 
 def test_stores_without_fields_move_nothing(tmp_path):

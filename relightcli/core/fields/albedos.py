@@ -12,23 +12,17 @@ the object is simulated, and are interpolated for each colour's own albedo a:
 What is left out is of third order in K: nothing for a convex object, where K = 0. A texture of greys is part of K and
 G. [left open in Pan 2007, whose materials are fixed]
 
-Of an object with a specular lobe one transfer is known, at the material that it was simulated with. What its own points
-make of light follows every change (`fields.shade`); what it sends to others is taken in proportion to all the light
-that it reflects, M ~ M(old) rho / rho(old). For a convex object under even light that is right in its amount; the
-directions stay those of the old lobe, and reflections on itself those of the old material.
+Objects with a specular lobe: `lobe_functions`.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from relightcli.core.brdf.separable import POLAR
 from relightcli.core.fields.compression import CompressedTransfer
-from relightcli.core.fields.entities import Transfer
 
 # The third-order error of (1 - a K)^-1, K = 1/2 as in half a sphere, is about 1 % at 0, 0.8 and 1.
 NODES = (0.15, 0.6, 0.95)
@@ -50,33 +44,14 @@ def transfer_weights(albedo: tuple[float, float, float]) -> NDArray[np.float64]:
     return self_weights(albedo) * a / np.array(NODES)[:, None]
 
 
-def reflectance(
-    diffuse: NDArray[np.floating], specular: NDArray[np.floating], lobe: NDArray[np.float32]
-) -> NDArray[np.float64]:
-    """rho (3,): the share of even light that a surface reflects, of diffuse and specular colours (3,) and the lobe's
-    responses (POLAR, B) (`fields.body`): diffuse + specular * integral of 2 cos sin sqrt(4 pi) F_00(theta) d theta."""
-    x = (np.arange(POLAR) + 0.5) / POLAR  # sqrt(1 - cos), of which F is a table: 2 cos sin d theta is 4 x (1 - x^2) dx
-    of_lobe = float((4.0 * x * (1.0 - x * x) * lobe[:, 0]).sum()) / POLAR * math.sqrt(4.0 * math.pi)
-    found: NDArray[np.float64] = np.asarray(diffuse, np.float64) + np.asarray(specular, np.float64) * of_lobe
-    return found
-
-
-@dataclass(frozen=True)
-class Scaled:
-    """A transfer times a factor (3,) of every colour."""
-
-    transfer: Transfer
-    factor: NDArray[np.float32]
-
-    def reflect(self, light: NDArray[np.floating], which: NDArray[np.integer]) -> NDArray[np.float32]:
-        out: NDArray[np.float32] = self.transfer.reflect(light, which) * self.factor[:, None]
-        return out
+def mixed(made: CompressedTransfer, weights: NDArray[np.float64]) -> CompressedTransfer:
+    """A transfer of nodes or functions in the place of colours, for an object that weighs them so: (nodes, colours)."""
+    m, n, _, nodes = made.shape
+    weight = weights.astype(np.float32)
+    component = made.component.reshape(-1, nodes).astype(np.float32) @ weight
+    return replace(made, shape=(m, n, n, weight.shape[1]), component=component.reshape(len(made.component), -1))
 
 
 def transfer_at(made: CompressedTransfer, albedo: tuple[float, float, float]) -> CompressedTransfer:
     """A transfer whose colours are the nodes, for an object of this albedo (3,), 0 to 1."""
-    m, n, _, nodes = made.shape
-    weights = transfer_weights(albedo).astype(np.float32)
-    mixed = made.component.reshape(-1, nodes).astype(np.float32) @ weights
-    colours = weights.shape[1]
-    return replace(made, shape=(m, n, n, colours), component=mixed.reshape(len(made.component), -1))
+    return mixed(made, transfer_weights(albedo))

@@ -11,21 +11,24 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from relightcli.core.fields.body import Body, axes
 from relightcli.core.fields.field import Field, SelfTransfer, shell_radii
-from relightcli.core.fields.proxies import place_proxies
+from relightcli.core.fields.lobe_functions import FunctionExits, gather_by_function
+from relightcli.core.fields.proxies import place_proxies, proxy_weights
 from relightcli.core.fields.sampling import blocked, cone_rays, gather, sample_points, trace
 from relightcli.core.fields.self_transfer import solve
+from relightcli.core.fields.shared_exits import SharedExits, gather_shared, share_exits
 from relightcli.core.sphere import sh
 from relightcli.core.transport.tracer import Tracer
 
 RAYS = 1024  # of a sample, through the cone of the bounding sphere; four times as many from inside it
 _BATCH = 64  # samples traced together
+Exits: TypeAlias = NDArray[np.float32] | SharedExits | FunctionExits
 
 
 class Samples(NamedTuple):
@@ -40,7 +43,7 @@ class Samples(NamedTuple):
 def field_samples(
     tracer: Tracer,
     body: Body,
-    exits: NDArray[np.float32],
+    exits: Exits,
     radii: NDArray[np.float64],
     resolution: int,
     start: int,
@@ -48,12 +51,15 @@ def field_samples(
     rays: int = RAYS,
     seed: int = 0,
 ) -> Samples:
-    """Samples start .. stop, counted through all shells. exits (P, terms, m N C) from `self_transfer.solve`.
+    """Samples start .. stop, counted through all shells. exits (P, terms, m N C) from `self_transfer.solve`, as it is,
+    from `short`, or by the functions of `lobe_functions`, which take the place of colours.
 
     A sample is not valid if more than half of what is seen from it are backs of one-sided faces: it lies inside.
     """
-    n, colours = body.order**2, body.colours
-    proxies = exits.shape[2] // (n * colours)
+    n = body.order**2
+    lights = exits.shape[2] if isinstance(exits, np.ndarray) else exits.lights
+    colours = 1 + len(exits.table) if isinstance(exits, FunctionExits) else body.colours
+    proxies = lights // (n * colours)
     frames = axes(body.normal)
     valid = np.ones(stop - start, bool)
     occlusion = np.empty((stop - start, n), np.float32)
@@ -70,11 +76,21 @@ def field_samples(
         hidden = blocked(found, harmonics)
         hidden[:, 0] -= math.sqrt(4.0 * math.pi)
         occlusion[rows] = -hidden
-        seen = gather(found, harmonics, exits, body, frames).reshape(-1, n, proxies, n, colours)
-        transfer[rows] = seen.transpose(0, 2, 1, 3, 4)
+        if isinstance(exits, SharedExits):
+            seen = gather_shared(found, harmonics, exits, body, frames)
+        elif isinstance(exits, FunctionExits):
+            seen = gather_by_function(found, harmonics, exits, body, frames)
+        else:
+            seen = gather(found, harmonics, exits, body, frames)
+        transfer[rows] = seen.reshape(-1, n, proxies, n, colours).transpose(0, 2, 1, 3, 4)
         valid[rows] = 2 * found.back <= count
         traced += len(weight) * count
     return Samples(valid, occlusion, transfer, traced)
+
+
+def short(body: Body, exits: NDArray[np.float32], proxies: NDArray[np.float64]) -> NDArray[np.float32] | SharedExits:
+    """Exits in the form that is summed fastest: of a diffuse object, a number per light, as they are."""
+    return exits if body.terms == 1 else share_exits(exits, proxy_weights(body.point, proxies, body.radius))
 
 
 def _batches(inside: NDArray[np.bool_]) -> list[tuple[int, int]]:
@@ -102,7 +118,8 @@ def build_field(
     solution = solve(tracer, body, centres, tolerance, seed)
     radii = shell_radii(body.radius, shells, spacing)
     cells = 6 * resolution * resolution
-    found = field_samples(tracer, body, solution.exits, radii, resolution, 0, shells * cells, rays, seed)
+    exits = short(body, solution.exits, centres)
+    found = field_samples(tracer, body, exits, radii, resolution, 0, shells * cells, rays, seed)
     field = Field(
         body.center,
         body.radius,

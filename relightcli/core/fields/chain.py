@@ -190,8 +190,8 @@ def passing(lookup: Lookup, rows: NDArray[np.float32], threads: int = 1, merged:
 
 
 class _Terms(NamedTuple):
-    """The coefficients of products, k slowest: those of k, filled up to a multiple of four, are start[k] to
-    start[k + 1]; i, j: where the factors' lanes begin."""
+    """The coefficients of products, two of the same k and j together, k slowest: those of k, filled up to a multiple of
+    four pairs, are start[k] to start[k + 1]; i (T, 2), j (T,): where the factors' lanes begin; value (T, 2)."""
 
     start: NDArray[np.int64]
     i: NDArray[np.int64]
@@ -202,12 +202,17 @@ class _Terms(NamedTuple):
 @lru_cache(maxsize=8)
 def _terms(order: int) -> _Terms:
     table = coefficients(order)
-    count = np.bincount(table.k, minlength=order**2)
-    start = np.concatenate([[0], np.cumsum(-(-count // 4) * 4)]).astype(np.int64)
-    place = np.arange(len(table.k)) + (start[:-1] - (np.cumsum(count) - count))[table.k]
-    i, j, value = np.zeros(start[-1], np.int64), np.zeros(start[-1], np.int64), np.zeros(start[-1], np.float32)
-    i[place], j[place], value[place] = STEP * table.i, 3 * STEP * table.j, table.value
-    return _Terms(start, i, j, value)
+    pairs: list[list[tuple[int, list[tuple[int, float]]]]] = [[] for _ in range(order**2)]
+    for k, j in sorted(set(zip(table.k.tolist(), table.j.tolist(), strict=True))):
+        own = np.flatnonzero((table.k == k) & (table.j == j))
+        terms = [(int(table.i[t]), float(table.value[t])) for t in own] + [(0, 0.0)] * (len(own) % 2)
+        pairs[k] += [(j, terms[t : t + 2]) for t in range(0, len(terms), 2)]
+    filled = [own + [(0, [(0, 0.0)] * 2)] * (-len(own) % 4) for own in pairs]
+    start = np.cumsum([0, *map(len, filled)], dtype=np.int64)
+    flat = [pair for own in filled for pair in own]
+    i = np.array([[STEP * factor for factor, _ in terms] for _, terms in flat], np.int64)
+    value = np.array([[number for _, number in terms] for _, terms in flat], np.float32)
+    return _Terms(start, i, np.array([3 * STEP * j for j, _ in flat], np.int64), value)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
@@ -304,21 +309,20 @@ def _add_samples(rows, place, weight, part, row):  # type: ignore[no-untyped-def
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
 def _add_products(passes, light, new, start, ti, tj, value):  # type: ignore[no-untyped-def]
-    """Adds passes times light to new. Four terms at a time, in slices: the compiler makes vectors of nothing else that
-    was tried, and what is added to is read and written once in four times."""
+    """Adds passes times light to new. Four pairs at a time, in slices: the compiler makes vectors of nothing else that
+    was tried, and what is added to is read and written once in four times. A pair has one factor of the light, which is
+    the longest."""
     colour = 3 * STEP
     for k in range(len(start) - 1):
         o = new[k * colour : (k + 1) * colour]
         for t in range(start[k], start[k + 1], 4):
-            i0, i1, i2, i3 = ti[t], ti[t + 1], ti[t + 2], ti[t + 3]
             j0, j1, j2, j3 = tj[t], tj[t + 1], tj[t + 2], tj[t + 3]
-            v0, v1, v2, v3 = value[t], value[t + 1], value[t + 2], value[t + 3]
-            a, b, c, d = (
-                passes[i0 : i0 + LANES],
-                passes[i1 : i1 + LANES],
-                passes[i2 : i2 + LANES],
-                passes[i3 : i3 + LANES],
-            )
+            a, b = passes[ti[t, 0] : ti[t, 0] + LANES], passes[ti[t, 1] : ti[t, 1] + LANES]
+            c, d = passes[ti[t + 1, 0] : ti[t + 1, 0] + LANES], passes[ti[t + 1, 1] : ti[t + 1, 1] + LANES]
+            e, f = passes[ti[t + 2, 0] : ti[t + 2, 0] + LANES], passes[ti[t + 2, 1] : ti[t + 2, 1] + LANES]
+            u, v = passes[ti[t + 3, 0] : ti[t + 3, 0] + LANES], passes[ti[t + 3, 1] : ti[t + 3, 1] + LANES]
+            va, vb, vc, vd = value[t, 0], value[t, 1], value[t + 1, 0], value[t + 1, 1]
+            ve, vf, vu, vv = value[t + 2, 0], value[t + 2, 1], value[t + 3, 0], value[t + 3, 1]
             x, y, z, w = (
                 light[j0 : j0 + colour],
                 light[j1 : j1 + colour],
@@ -326,7 +330,8 @@ def _add_products(passes, light, new, start, ti, tj, value):  # type: ignore[no-
                 light[j3 : j3 + colour],
             )
             for lane in range(LANES):
-                p, q, r, s = v0 * a[lane], v1 * b[lane], v2 * c[lane], v3 * d[lane]
+                p, q = va * a[lane] + vb * b[lane], vc * c[lane] + vd * d[lane]
+                r, s = ve * e[lane] + vf * f[lane], vu * u[lane] + vv * v[lane]
                 g, h = STEP + lane, 2 * STEP + lane
                 o[lane] += p * x[lane] + q * y[lane] + r * z[lane] + s * w[lane]
                 o[g] += p * x[g] + q * y[g] + r * z[g] + s * w[g]

@@ -229,17 +229,19 @@ def _common_basis(
         sketch = np.zeros((rows.width, size))
         for own in rows.about(mean):
             sketch += own.T @ rng.standard_normal((len(own), size), np.float32)
-        coordinates = np.empty((count, size), np.float32)
-        for _ in range(2):
-            basis, _ = np.linalg.qr(sketch)
-            sketch, gram, total, start = np.zeros_like(sketch), np.zeros((size, size)), 0.0, 0
-            for own in rows.about(mean):
-                along = own @ basis.astype(np.float32)
-                sketch += own.T @ along
-                coordinates[start : start + len(own)] = along
-                gram += along.T.astype(np.float64) @ along
-                total += float(np.einsum("ij,ij->", own, own, dtype=np.float64))
-                start += len(own)
+        small = np.linalg.qr(sketch)[0].astype(np.float32)
+        sketch = np.zeros_like(sketch)
+        for own in rows.about(mean):
+            sketch += own.T @ (own @ small)
+        basis, _ = np.linalg.qr(sketch)
+        small = basis.astype(np.float32)
+        coordinates, gram, total, start = np.empty((count, size), np.float32), np.zeros((size, size)), 0.0, 0
+        for own in rows.about(mean):
+            along = own @ small
+            coordinates[start : start + len(own)] = along
+            gram += along.T.astype(np.float64) @ along
+            total += float(np.einsum("ij,ij->", own, own, dtype=np.float64))
+            start += len(own)
         spectrum, vectors = gram_spectrum(gram)
         left = np.maximum(total - np.cumsum(spectrum), 0.0)
         if left[-1] <= most or size == min(rows.width, count):

@@ -8,6 +8,7 @@ angle: w = (the cone's solid angle) / (the number of rays).
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,12 +60,27 @@ def cone_rays(
     """
     directions = np.empty((len(points), count, 3), np.float32)
     weight = np.empty(len(points))
-    _fill_cones(np.ascontiguousarray(points), center, radius, first, seed, directions, weight)
+    _fill_cones(np.ascontiguousarray(points), center, radius, first, seed, _order(count), directions, weight)
     return directions, weight
 
 
+@lru_cache(maxsize=8)
+def _order(count: int) -> NDArray[np.int64]:
+    """The lattice's points square by square of the disc that they fill: neighbours are traced together, and hit what
+    lies close together in memory."""
+    k = np.arange(count)
+    radius, phi = np.sqrt((k + 0.5) / count), k * GOLDEN_ANGLE
+    x, y = (np.floor(32 * (1 + radius * f(phi))).astype(np.int64) for f in (np.cos, np.sin))
+    code = np.zeros(count, np.int64)
+    for bit in range(6):
+        code |= (x >> bit & 1) << 2 * bit | (y >> bit & 1) << 2 * bit + 1
+    return np.argsort(code, kind="stable")
+
+
 @njit(cache=True)
-def _fill_cones(points: Any, center: Any, radius: float, first: int, seed: int, directions: Any, weight: Any) -> None:
+def _fill_cones(
+    points: Any, center: Any, radius: float, first: int, seed: int, order: Any, directions: Any, weight: Any
+) -> None:
     count = directions.shape[1]
     for i in range(len(points)):
         x, y, z = center[0] - points[i, 0], center[1] - points[i, 1], center[2] - points[i, 2]
@@ -77,13 +93,14 @@ def _fill_cones(points: Any, center: Any, radius: float, first: int, seed: int, 
             height = sine2 / (1.0 + math.sqrt(1.0 - sine2))  # 1 - cos of the half-angle
         turn, _ = point(stream_key(seed, first + i, 0), 0, 0)
         weight[i] = 2.0 * math.pi * height / count
-        for k in range(count):
+        for at in range(count):
+            k = order[at]
             down = height * (k + 0.5) / count
             sine = math.sqrt(down * (2.0 - down))
             phi = 2.0 * math.pi * turn + k * GOLDEN_ANGLE
             d = about(axis, sine * math.cos(phi), sine * math.sin(phi), 1.0 - down)
             for c in range(3):
-                directions[i, k, c] = d[c]
+                directions[i, at, c] = d[c]
 
 
 def trace(
@@ -174,7 +191,15 @@ def _gather(found: Any, harmonics: Any, exits: Any, lobe: Any, frames: Any, orde
 
 def blocked(found: Found, harmonics: NDArray[np.float32]) -> NDArray[np.float64]:
     """Coefficients (S, N) float64 of what the hits hide: sum of w y_i; harmonics (H, N)."""
-    running = np.zeros((len(harmonics) + 1, harmonics.shape[1]))
-    np.cumsum(harmonics, axis=0, dtype=np.float64, out=running[1:])
-    out: NDArray[np.float64] = (running[found.start[1:]] - running[found.start[:-1]]) * found.weight[:, None]
+    out = np.zeros((len(found.weight), harmonics.shape[1]))
+    _sum_up(found.start, harmonics, found.weight, out)
     return out
+
+
+@njit(cache=True)
+def _sum_up(start: Any, harmonics: Any, weight: Any, out: Any) -> None:
+    for s in range(len(out)):
+        for r in range(start[s], start[s + 1]):
+            for i in range(out.shape[1]):
+                out[s, i] += harmonics[r, i]
+        out[s] *= weight[s]

@@ -95,6 +95,13 @@ def test_own_reflections_of_a_bowl_by_their_number():
         )
 
 
+def test_a_convex_object_reflects_nothing_on_itself():
+    body = ball(grey(0.9), 12)
+    found = solve(tracer_of(body), body, place_proxies(body.point, 3))
+    assert not found.by_order[..., 1:].any()
+    assert found.by_order[..., 0].any()
+
+
 def test_the_field_of_a_ball_is_a_disc_at_every_distance():
     """Solid angle and form factor (KT3, KT4) within 1 %, from all samples; a bright ball and a black one."""
     body = ball(grey(0.6), 48)

@@ -31,9 +31,9 @@ def test_an_object_of_few_points_has_few_proxies():
     np.testing.assert_array_equal(place_proxies(np.full((5, 3), 4.0), 8), [[4.0, 4, 4]])
 
 
-def test_weights_are_inverse_distances_and_one_hot_at_a_proxy():
+def test_weights_are_inverse_squares_of_distances_and_one_hot_at_a_proxy():
     proxies = np.array([[0.0, 0, 0], [3, 0, 0]])
     weights = proxy_weights(np.array([[1.0, 0, 0], [3, 0, 0], [3, 5e-7, 0], [0, 4, 0]]), proxies, 1.0)
-    np.testing.assert_allclose(weights, [[2 / 3, 1 / 3], [0, 1], [0, 1], [5 / 9, 4 / 9]], rtol=1e-15)
+    np.testing.assert_allclose(weights, [[4 / 5, 1 / 5], [0, 1], [0, 1], [25 / 41, 16 / 41]], rtol=1e-15)
     twice = proxy_weights(np.zeros((1, 3)), np.array([[0.0, 0, 0], [0, 0, 0], [1, 0, 0]]), 1.0)
     np.testing.assert_array_equal(twice, [[0.5, 0.5, 0]])
