@@ -174,8 +174,10 @@ class Runs:
             return values[:0]
         if len(cells) > MANY:
             return self.sum(values)[cells]
-        last = np.append(self.first, len(values))
-        return np.stack([values[last[k] : last[k + 1]].sum(axis=0) for k in cells])
+        first = self.first[cells]
+        count = np.append(self.first, len(values))[cells + 1] - first
+        start = np.cumsum(count) - count
+        return np.add.reduceat(values[np.arange(count.sum()) + np.repeat(first - start, count)], start)
 
 
 class _Cut:
@@ -450,10 +452,17 @@ def changed_rows(old: NDArray[np.float32], new: NDArray[np.float32]) -> NDArray[
     return rows
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _changed_rows(old, new, rows):  # type: ignore[no-untyped-def]
+    width = old.shape[1]
     for i in range(old.shape[0]):
-        for j in range(old.shape[1]):
+        one, other = old[i].reshape(3 * width), new[i].reshape(3 * width)
+        unlike = 0
+        for k in range(3 * width):  # without a branch: most rows are alike
+            unlike |= one[k] != other[k]
+        if not unlike:
+            continue
+        for j in range(width):
             if old[i, j, 0] != new[i, j, 0] or old[i, j, 1] != new[i, j, 1] or old[i, j, 2] != new[i, j, 2]:
                 if rows[j, 1] == 0:
                     rows[j, 0] = i
