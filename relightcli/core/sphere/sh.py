@@ -24,8 +24,8 @@ def harmonics(directions: NDArray[np.float64], order: int) -> NDArray[np.float64
         y_lm = N_lm Q_lm(z) Re (x + i y)^m,    y_l-m = N_lm Q_lm(z) Im (x + i y)^m,    m >= 0
 
     N_lm = sqrt((2 - d_m0) (2 l + 1) / (4 pi) (l - m)! / (l + m)!), Q_lm = P_lm / (1 - z^2)^(m/2), P the associated
-    Legendre functions without phase. On the caller's thread alone: for as few directions as most callers have, threads
-    cost a thousand times what they take off.
+    Legendre functions without phase. On the caller's thread alone: most callers have few directions, for which waking
+    others takes longer than the work.
     """
     flat = np.ascontiguousarray(np.asarray(directions, np.float64).reshape(-1, 3))
     values = np.empty((len(flat), order * order))
