@@ -8,7 +8,7 @@ they are lit is known once they can be posed (`promise_pose`).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -48,14 +48,6 @@ POINTS = 256  # of an object, which the way has to be free for
 MOST_MOVED = 4  # objects that are moved
 # Where moves begin to look for their way, in azimuths: those that settings are chosen by, and that of the check.
 TRIAL, CHECK = (0.0, 3.3), 5.6
-
-
-@dataclass(frozen=True)
-class Rung:
-    """Fields that were tried, and the error with them."""
-
-    settings: FieldSettings
-    error: Share
 
 
 def rungs(asked: FieldSettings) -> list[FieldSettings]:
