@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import random
-import time
 
 import pytest
 
@@ -20,25 +18,26 @@ def test_killed_while_writing_a_sequence(finished, pattern):
     """Whatever stands under a frame's name is the old file or the whole new one."""
     (finished / "frames.toml").write_text(FRAMES)
     arguments = ("relight", "t.zarr", "--frames", "frames.toml", "-o", pattern)
-    started = time.monotonic()
     assert harness.run(finished, *arguments)[0] == 0
-    whole = time.monotonic() - started
     names = [pattern.replace("##", f"{k:02d}") for k in range(1, 7)]
     expected = {name: (finished / name).read_bytes() for name in names}
-    random_ = random.Random(3)
-    found = []
+
+    def content(name: str) -> bytes | None:
+        return (finished / name).read_bytes() if (finished / name).exists() else None
+
     for round_ in range(4):
+        old = b"old" if round_ % 2 else None
         for name in names:
-            (finished / name).write_bytes(b"old") if round_ % 2 else (finished / name).unlink()
+            (finished / name).unlink() if old is None else (finished / name).write_bytes(old)
         process = harness.start(finished, *arguments)
-        time.sleep(random_.uniform(0.4, 1.0) * whole)
+        ended = None
+        while content(names[round_]) != expected[names[round_]]:  # killed with that many frames before it
+            assert ended is None, process.communicate()[1]
+            ended = process.poll()
         harness.kill_group(process)
+        assert all(content(name) in (expected[name], old) for name in names)
         for name in names:
-            data = (finished / name).read_bytes() if (finished / name).exists() else None
-            assert data == expected[name] or data == (b"old" if round_ % 2 else None), name
             (finished / name).write_bytes(b"old")
-            found.append(data == expected[name])
-    assert any(found)  # else every kill came before the first frame
 
 
 def test_what_killed_writers_left_goes_with_the_next_picture(tmp_path):
