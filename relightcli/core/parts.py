@@ -65,6 +65,12 @@ def in_order(work: Callable[[A], B], items: Sequence[A], threads: int) -> Genera
         pool.shutdown(cancel_futures=True)
 
 
+def for_each(work: Callable[[A], None], items: Sequence[A], threads: int) -> None:
+    """Calls work(item) for every item, several at a time."""
+    for _ in in_order(work, items, threads):
+        pass
+
+
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
     """Products and decompositions inside stay on the thread that asks for them: threads of this file do the rest.

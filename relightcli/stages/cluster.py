@@ -18,9 +18,9 @@ import relight_formats as formats
 from relightcli import __version__
 from relightcli.adapters.files import need_output
 from relightcli.core.brdf.transport_basis import FUNCTIONS
-from relightcli.core.compress.cpca import cpca
+from relightcli.core.compress.groups import grouped
 from relightcli.core.compress.tucker import gram_spectrum
-from relightcli.core.parts import in_order, one_blas_thread
+from relightcli.core.parts import for_each, in_order, one_blas_thread
 from relightcli.errors import InputError, StoreError
 from relightcli.run.accounting import Account, Meter
 from relightcli.stages.budget import summary
@@ -31,12 +31,10 @@ from relightcli.stages.transfer_setup import BLOCK, CELLS, TransferSetup, coarse
 
 KIND = "clusters"
 ORDER = 4  # bands of the tensors
-TERMS = 16  # eigenvectors of a cluster when receivers are grouped
 TOLERANCE = 0.01  # of the basis for light, unless there is a reason for another
 SKETCH = 128  # random directions that stand in for a receiver's tensor
 SAMPLE = 1024  # receivers whose full tensors show what light they react to
 RECEIVERS_PER_CLUSTER = 1000
-LARGEST = 2.0  # a cluster with more than so many times the mean is cut: the cost goes with the square
 
 
 @dataclass(frozen=True)
@@ -80,9 +78,7 @@ def cluster(config: Config) -> dict[str, Any]:
         "order": ORDER,
     }
     if config.dry_run:
-        costs = predict_cluster(
-            lighting, clusters, tolerance, config.functions, config.seed, SAMPLE, ORDER, TERMS, SKETCH
-        )
+        costs = predict_cluster(lighting, clusters, tolerance, config.functions, config.seed, SAMPLE, ORDER, SKETCH)
         told = {"dry_run": True, "receivers": len(lighting), "clusters": clusters, "notes": []}
         return {**told, "predicted": costs.as_json(account)}
     writer = formats.begin(
@@ -101,7 +97,7 @@ def cluster(config: Config) -> dict[str, Any]:
         with account.step("copying"):
             copy_arrays(lighting.store, writer, lighting.store.names())
         with account.step("reading"):
-            setup = TransferSetup(lighting, config.functions, config.workers)
+            setup = TransferSetup(lighting, config.functions, config.workers, writer.partial_path)
         if "light-basis" not in writer.done:
             with account.step("light-basis"):
                 meter = Meter()
@@ -112,10 +108,8 @@ def cluster(config: Config) -> dict[str, Any]:
             with account.step("groups"):
                 meter = Meter()
                 rows = _sketch(setup, config)
-                found = cpca(rows, clusters, TERMS, config.seed, config.workers)
-                label = split_large(rows, found.label, int(LARGEST * len(rows) / found.count) + 1)
+                label, left = grouped(rows, clusters, config.seed, config.workers)
                 writer.put("cluster/label", label, dims=("receiver",))
-                left = float(np.sqrt(found.residuals[-1] / found.norm2)) if found.norm2 else 0.0
                 writer.record("groups", {**meter.read(), "clusters": int(label.max()) + 1, "error": left})
         spare = left_over(lighting.store)
         if spare is not None:
@@ -141,24 +135,6 @@ def direct_only(path: Path) -> bool:
     """Whether a transfer store holds no interreflections, so that only its lights can be clustered."""
     store = formats.open_store(path)
     return store.kind == "transfer" and "bounce/hit" not in store
-
-
-def split_large(rows: NDArray[np.floating[Any]], label: NDArray[np.int32], most: int) -> NDArray[np.int32]:
-    """Labels with every cluster of more than `most` rows cut into even parts along its first principal direction."""
-    out, new = label.copy(), int(label.max()) + 1
-    for c in range(new):
-        members = np.flatnonzero(label == c)
-        parts = -(-len(members) // most)
-        if parts < 2:
-            continue
-        own = rows[members].astype(np.float64)
-        centred = own - own.mean(0)
-        _, vectors = gram_spectrum(centred.T @ centred)
-        order = members[np.argsort(centred @ vectors[:, 0], kind="stable")]
-        for part in np.array_split(order, parts)[1:]:
-            out[part] = new
-            new += 1
-    return out
 
 
 def _need_bounces(lighting: LightingStore) -> None:
@@ -212,11 +188,11 @@ def _light_basis(setup: TransferSetup, tolerance: float, seed: int) -> tuple[NDA
     picked = np.random.default_rng(seed).permutation(n)[:SAMPLE]
     cells = 6 * CELLS * CELLS
     tensors = np.empty((len(picked), setup.count * ORDER * ORDER, cells), np.float32)
+    seen = setup.seen_from(picked)
     for face in range(6):
         own = slice(face * CELLS * CELLS, (face + 1) * CELLS * CELLS)
-        sources = setup.sources(np.eye(cells, dtype=np.float32)[:, own])
-        found = setup.gather_rows(picked, sources, ORDER)[..., : CELLS * CELLS]
-        tensors[:, :, own] = found.reshape(len(picked), -1, CELLS * CELLS)
+        sources = setup.sources(np.eye(cells, dtype=np.float32)[:, own], seen)
+        tensors[:, :, own] = setup.gather_rows(picked, sources, ORDER).reshape(len(picked), -1, CELLS * CELLS)
         del sources
     half = max(1, len(picked) // 2)
     rows = tensors[:half].reshape(-1, cells)
@@ -250,6 +226,5 @@ def _sketch(setup: TransferSetup, config: Config) -> NDArray[np.float32]:
         rows = np.arange(start, min(start + BLOCK, n))
         out[rows] = setup.gather_rows(rows, sources, ORDER).reshape(len(rows), -1) @ directions
 
-    for _ in in_order(project, range(0, n, BLOCK), setup.threads):
-        pass
+    for_each(project, range(0, n, BLOCK), setup.threads)
     return out

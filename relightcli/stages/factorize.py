@@ -125,7 +125,7 @@ def factorize(config: Config) -> dict[str, Any]:
         with account.step("copying"):
             copy_arrays(store, writer, names_but(store, LEFT_OUT))
         with account.step("reading"):
-            setup = TransferSetup(lighting, int(store.settings["functions"]), config.workers)
+            setup = TransferSetup(lighting, int(store.settings["functions"]), config.workers, writer.partial_path)
         order, start = _by_cluster(label)
         writer.put("cluster/receiver", order.astype(np.int32), dims=("receiver",))
         writer.put("cluster/start", start, dims=("boundary",))
@@ -170,7 +170,7 @@ def _predict(
         writer.put("one_bounce/basis", basis, dims=("light_cell", "light"))
         out.bytes += stored_bytes(writer, "cluster") + stored_bytes(writer, "one_bounce")
         with out.timed():
-            setup = PilotSetup(lighting, int(store.settings["functions"]), config.workers)
+            setup = PilotSetup(lighting, int(store.settings["functions"]), config.workers, writer.partial_path)
             ranks = _ranks(config, left, writer, setup, basis, order, start, bands if bounces else 0)
     out.add(predict_direct(lighting, ranks.coefficients, config.brdf_ranks))
 

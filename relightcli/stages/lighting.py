@@ -29,7 +29,7 @@ from relightcli.stages.rig_store import read_rigs
 
 if TYPE_CHECKING:
     from relightcli.core.shade.bounces import Exit
-    from relightcli.core.shade.gather import Gather
+    from relightcli.core.shade.gather import Gather, Zeros
     from relightcli.core.shade.lobe_factors import LobeFactors
 
 IN_MEMORY = 1 << 30  # visibility up to this size stays in memory between frames
@@ -302,7 +302,7 @@ class LightingStore:
         coats = self._coats_of(materials)
         if coats.shiny.any() and view is None:
             raise InputError("a material with a specular lobe looks different from everywhere: a --camera is needed")
-        streamed = bool(bounces) and self.streams and self._hit_bytes() > IN_MEMORY
+        streamed = bool(bounces) and self.streams and self.hit_bytes() > IN_MEMORY
         gather = self.gather(self.pixels) if bounces and not streamed else None
         lit = active if gather is None and not streamed else None
         direct = self._direct(environment, rotate, coats, view, active, lit, basis or self.basis)
@@ -524,9 +524,18 @@ class LightingStore:
         if first not in self._gathered:
             from relightcli.core.shade.gather import join
 
-            step = len(self) if self._hit_bytes() <= IN_MEMORY else self._chunk
+            step = len(self) if self.hit_bytes() <= IN_MEMORY else self._chunk
             self._gathered[first] = join([part for _, part in self._gathers(first, len(self), step)])
         return self._gathered[first]
+
+    def gather_into(self, zeros: Zeros) -> Gather:
+        """`gather` in arrays that `zeros` makes, part by part; for what memory need not hold."""
+        from relightcli.core.shade.gather import collect
+
+        hits: Any = self.store.array("bounce/hit")
+        step = hits.chunks[0]
+        entries = sum(int(np.count_nonzero(hits[a : a + step])) for a in range(0, len(self), step))
+        return collect((part for _, part in self._some_gathers(0, len(self))), len(self), entries, zeros)
 
     def _gathers(self, first: int, last: int, step: int) -> Iterator[tuple[int, Gather]]:
         """Who sees whom, of the receivers from `first` to `last`, at most `step` at a time; with each part's first."""
@@ -543,7 +552,7 @@ class LightingStore:
         """`_gathers` of some receivers at a time, so that there are no more than ENTRIES."""
         return self._gathers(first, last, max(1, ENTRIES // int(np.prod(self.store.layouts["bounce/hit"].shape[1:]))))
 
-    def _hit_bytes(self) -> int:
+    def hit_bytes(self) -> int:
         """Of whom the receivers see, in memory."""
         return self.store.layouts["bounce/hit"].raw_bytes if "bounce/hit" in self.store else 0
 

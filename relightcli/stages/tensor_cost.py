@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 import relight_formats as formats
 from relightcli.core.compress.cpca import cpca
+from relightcli.core.compress.groups import TERMS, TOGETHER
 from relightcli.core.compress.tucker import gram_spectrum
 from relightcli.core.transport.transfer import Sources
 from relightcli.stages.check_cost import predict_check
@@ -34,16 +36,15 @@ def predict_cluster(
     seed: int,
     sample: int,
     order: int,
-    terms: int,
     sketch: int,
 ) -> Costs:
-    """Costs of cluster, but for opening the store. sample, order, terms, sketch: as `stages.cluster` has them."""
+    """Costs of cluster, but for opening the store. sample, order, sketch: as `stages.cluster` has them."""
     store, n, cells = lighting.store, len(lighting), 6 * CELLS * CELLS
     out = Costs()
     with scratch("clusters", store.settings, store.attrs) as writer:
         out.add(copying(store, store.names(), writer))
         with out.timed():
-            setup = TransferSetup(lighting, functions, lighting.threads)
+            setup = TransferSetup(lighting, functions, lighting.threads, writer.partial_path)
         eye = np.eye(cells, dtype=np.float32)
         # What a basis weighs matters in small stores, where all faces of the sky cost little.
         faces = range(6) if n <= SMALL else range(1)
@@ -52,9 +53,10 @@ def predict_cluster(
         with out.timed():
             sources = setup.sources(eye[:, : CELLS**2])  # loads kernels as well
             setup.gather_rows(picked[:FEW], sources, order)
-        # The rest of six faces for the basis, and six for the groups, of which one is done.
+        # Six faces of some for the basis, and six of all for the groups, of which one is done.
+        share = len(setup.seen_from(picked[:sample])) / n
         for face in faces:
-            with out.timed(11.0 / len(faces)):
+            with out.timed((5.0 + 6.0 * share) / len(faces)):
                 sources = setup.sources(eye[:, face * CELLS**2 : (face + 1) * CELLS**2])
             with out.timed(6.0 / len(faces) * min(n, sample) / len(some)):
                 parts.append(setup.gather_rows(some, sources, order)[..., : CELLS**2].reshape(-1, CELLS**2))
@@ -73,12 +75,13 @@ def predict_cluster(
             tensors = np.concatenate(rows).reshape(len(grouped), -1)
             directions = np.random.default_rng(seed).standard_normal((tensors.shape[1], min(sketch, tensors.shape[1])))
             drawn = tensors @ directions.astype(np.float32)
+        clusters = min(clusters, max(1, round(clusters * TOGETHER / n)))  # that a receiver is compared with
         own = min(clusters, FEW_CLUSTERS)
 
         def group(count: int) -> Costs:
             cost = Costs()
             with cost.timed():
-                label = cpca(drawn[:count], own, terms, seed).label
+                label = cpca(drawn[:count], own, TERMS, seed).label
             writer.put("cluster/label", label, dims=("receiver",))
             cost.bytes = stored_bytes(writer, "cluster")
             writer.drop("cluster/label")
@@ -100,12 +103,13 @@ class PilotSetup(TransferSetup):
     """Sources are made once for all that asks for them; those of second bounces from some receivers, as if the others
     were like them. `more`: what the others would take."""
 
-    def __init__(self, lighting: LightingStore, functions: int, threads: int) -> None:
-        super().__init__(lighting, functions, threads)
+    def __init__(self, lighting: LightingStore, functions: int, threads: int, folder: Path | None = None) -> None:
+        super().__init__(lighting, functions, threads, folder)
         self.known: dict[tuple[str, int], Sources] = {}
         self.more = Costs()
 
-    def sources(self, basis: NDArray[np.float32]) -> Sources:
+    def sources(self, basis: NDArray[np.float32], only: NDArray[np.int64] | None = None) -> Sources:
+        assert only is None  # nothing that is predicted asks for some
         key = "first", basis.shape[1]
         if key not in self.known:
             self.known[key] = super().sources(basis)

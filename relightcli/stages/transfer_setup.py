@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
+from relightcli.adapters.scratch import Scratch
 from relightcli.core.brdf.models import pack_materials
-from relightcli.core.shade.gather import Gather
+from relightcli.core.shade.gather import pick
 from relightcli.core.shade.lobe_factors import LobeFactors, local_lobes
 from relightcli.core.shade.local import local_radiance
 from relightcli.core.sphere import cube
@@ -22,13 +25,15 @@ from relightcli.core.transport.transfer import (
     used_terms,
 )
 from relightcli.errors import StoreError
-from relightcli.stages.lighting import LightingStore
+from relightcli.stages.lighting import IN_MEMORY, LightingStore
 
 CELLS = 8  # of a face of the sky, for one bounce
 COARSE = 2  # the same for two bounces
 LAMP_COLUMNS = 3  # the local lights' light, by colour, comes after the sky's cells
 FIT = 1024  # receivers at which lights are matched by the direct light that they give
 BLOCK = 512  # receivers whose tensors are gathered at a time
+SOME = 128  # the same where what they see lies in files
+SOURCES = 4096  # receivers whose light is taken at a time
 
 
 def fit_receivers(count: int) -> NDArray[np.int64]:
@@ -55,10 +60,14 @@ def cell_radiance(flux: NDArray[np.float64], resolution: int, cells: int) -> NDA
 
 
 class TransferSetup:
-    """Channels, gathers and sources of one store. `functions`: specular basis functions of an adjustable material."""
+    """Channels, gathers and sources of one store.
 
-    def __init__(self, lighting: LightingStore, functions: int, threads: int) -> None:
+    functions: specular basis functions of an adjustable material; folder: of the files that take the place of memory.
+    """
+
+    def __init__(self, lighting: LightingStore, functions: int, threads: int, folder: Path | None = None) -> None:
         self.lighting, self.threads = lighting, threads
+        self.scratch = Scratch(folder)
         scene, geometry = lighting.scene, lighting.geometry
         materials = list(scene.materials.values())
         self.table = pack_materials(materials)
@@ -72,7 +81,8 @@ class TransferSetup:
         self.partner = lighting.partner()
         self.texture = lighting.tint()
         self.lamps = LAMP_COLUMNS if scene.lights else 0
-        gather = lighting.gather()
+        outgrown = lighting.hit_bytes() > IN_MEMORY
+        gather = lighting.gather_into(self.scratch.zeros) if outgrown else lighting.gather()
         if gather is None:
             raise StoreError(f"{lighting.store.path}: nothing blocks anything in it; there are no interreflections")
         self.gather = gather
@@ -82,19 +92,30 @@ class TransferSetup:
         """Channels."""
         return len(self.channels.material)
 
-    def sources(self, basis: NDArray[np.float32]) -> Sources:
-        """Responses to the lights of `basis` (6 CELLS^2, L), the lamps' columns after them."""
+    def seen_from(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The receivers whose light some others reflect, rising."""
+        seen = np.unique(pick(self.gather, rows).source)
+        return np.unique(np.concatenate([seen, self.partner[seen]]))
+
+    def sources(self, basis: NDArray[np.float32], only: NDArray[np.int64] | None = None) -> Sources:
+        """Responses to the lights of `basis` (6 CELLS^2, L), the lamps' columns after them.
+
+        only: those that they are computed for, rising, without the lamps; None for all with them.
+        """
         lighting, used = self.lighting, used_terms(len(self.factors[0]))
         lights = basis.shape[1]
-        shiny = int((self.model >= 0).sum())
-        even = np.zeros((len(lighting), lights + self.lamps), np.float32)
-        factor = np.zeros((shiny, len(used), lights + self.lamps), np.float32)
-        for block, bits in lighting.blocks():
-            step = 4096
-            for start in range(block.start, block.stop, step):
-                rows = slice(start, min(start + step, block.stop))
-                part = bits[start - block.start : rows.stop - block.start]
-                own = self.row[rows]
+        lamps = self.lamps if only is None else 0
+        wanted, row = (np.arange(len(lighting)), self.row) if only is None else (only, self._rows_of(only))
+        even = self.scratch.zeros((len(lighting), lights + lamps), np.float32)
+        factor = self.scratch.zeros((int(row.max(initial=-1)) + 1, len(used), lights + lamps), np.float32)
+        needed = np.zeros(len(lighting), bool)
+        needed[wanted] = True
+        for block, bits in lighting.blocks(needed=needed):
+            ours = wanted[np.searchsorted(wanted, block.start) : np.searchsorted(wanted, block.stop)]
+            for start in range(0, len(ours), SOURCES):
+                rows = ours[start : start + SOURCES]
+                part = bits[rows - block.start]
+                own = row[rows]
                 own = own[own >= 0]
                 for face in range(6):
                     cells = basis[face * CELLS**2 : (face + 1) * CELLS**2]
@@ -113,9 +134,17 @@ class TransferSetup:
                     even[rows, :lights] += e @ cells
                     if len(own):
                         factor[own[0] : own[-1] + 1, :, :lights] += f @ cells
-        if self.lamps:
+                self.scratch.let_go()
+        if lamps:
             self._add_lamps(even, factor, used)
-        return Sources(even, factor, self.row, used, self.partner)
+        return Sources(even, factor, row, used, self.partner)
+
+    def _rows_of(self, only: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Rows of the light factors, (N,), if those receivers alone have any."""
+        row = np.full(len(self.row), -1, np.int32)
+        shiny = only[self.model[only] >= 0]
+        row[shiny] = np.arange(len(shiny))
+        return row
 
     def _add_lamps(self, even: NDArray[np.float32], factor: NDArray[np.float32], used: NDArray[np.int64]) -> None:
         lighting = self.lighting
@@ -144,27 +173,25 @@ class TransferSetup:
 
     def gather_rows(self, rows: NDArray[np.int64], sources: Sources, order: int) -> NDArray[np.float32]:
         """Transfer (len(rows), Q, S, L) of some receivers, `transfer.gather_transfer`."""
-        return gather_transfer(
-            self._rows(rows),
-            0,
-            sources,
-            self.exits,
-            self.count,
-            order,
-            self.lighting.normal,
-            self.material,
-            self.texture,
-            self.threads,
-        )
-
-    def _rows(self, rows: NDArray[np.int64]) -> Gather:
-        whole = self.gather
-        counts = whole.start[rows + 1] - whole.start[rows]
-        start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        index = np.repeat(whole.start[rows] - start[:-1], counts) + np.arange(start[-1])
-        return Gather(
-            whole.cells, start, whole.source[index], whole.cell[index], whole.cosine[index], whole.solid_angle[index]
-        )
+        step = SOME if self.scratch.used else max(1, len(rows))
+        parts = []
+        for start in range(0, len(rows), step):
+            parts.append(
+                gather_transfer(
+                    pick(self.gather, rows[start : start + step]),
+                    0,
+                    sources,
+                    self.exits,
+                    self.count,
+                    order,
+                    self.lighting.normal,
+                    self.material,
+                    self.texture,
+                    self.threads,
+                )
+            )
+            self.scratch.let_go()
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def second_sources(self, lights: Sources, order: int, only: NDArray[np.int64] | None = None) -> Sources:
         """What receivers gather of light that was reflected once: for each light of `lights` and channel, (l, q).
@@ -175,8 +202,8 @@ class TransferSetup:
         projections = np.stack([light_factor_projections(f, order) for f in self.factors])
         weights = projections[:, used[:, 1], used[:, 0]].astype(np.float32)  # (models, F, S)
         n, q, count = len(lighting), self.count, lights.even.shape[1]
-        even = np.empty((n, count * q), np.float32)
-        factor = np.zeros((int((self.model >= 0).sum()), len(used), count * q), np.float32)
+        even = self.scratch.zeros((n, count * q), np.float32)
+        factor = self.scratch.zeros((int((self.model >= 0).sum()), len(used), count * q), np.float32)
         wanted = np.arange(n) if only is None else only
         for start in range(0, len(wanted), BLOCK):
             rows = wanted[start : start + BLOCK]

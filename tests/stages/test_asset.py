@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 import relight_formats as formats
+from relightcli.adapters.scratch import Scratch
 from relightcli.core.brdf.models import pack_materials
 from relightcli.core.measure.errors import relative_rmse
 from relightcli.core.transport.channels import coefficients
 from relightcli.errors import InputError, StoreError
 from relightcli.scene.model import Camera
-from relightcli.stages import cluster, direct_tensors, factorize
+from relightcli.stages import cluster, direct_tensors, factorize, transfer_setup
 from relightcli.stages.lighting import LightingStore
 from relightcli.stages.relight import Config, relight
 from relightcli.stages.transfer_setup import TransferSetup, coarse_cells
@@ -71,6 +72,29 @@ def asset(clusters):
     output = clusters.parent / "asset.zarr"
     factorize.factorize(factorize.Config(clusters, output, workers=2))
     return output
+
+
+def test_arrays_that_outgrow_memory_change_nothing(transfer, clusters, asset, tmp_path, monkeypatch):
+    given = []
+
+    class Small(Scratch):
+        def __init__(self, folder):
+            super().__init__(folder, limit=0)
+            given.append(self)
+
+        def let_go(self):
+            assert self.used
+            super().let_go()
+
+    monkeypatch.setattr(transfer_setup, "Scratch", Small)
+    monkeypatch.setattr(transfer_setup, "IN_MEMORY", 0)
+    cluster.cluster(cluster.Config(transfer, tmp_path / "clusters.zarr", CLUSTERS, workers=2))
+    factorize.factorize(factorize.Config(clusters, tmp_path / "asset.zarr", workers=2))
+    for expected in (clusters, asset):
+        ours, theirs = formats.open_store(tmp_path / expected.name), formats.open_store(expected)
+        for name in theirs.names():
+            np.testing.assert_array_equal(ours.read(name), theirs.read(name), err_msg=name)
+    assert len(given) == 2
 
 
 def layers_of(store, name, **settings):

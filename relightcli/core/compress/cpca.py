@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from relightcli.core.compress.tucker import gram_spectrum
-from relightcli.core.parts import in_order
+from relightcli.core.parts import for_each, in_order
 from relightcli.errors import NumericalError
 
 ROUNDS = 12
@@ -114,8 +114,7 @@ def _assign(
         label[rows] = np.array([c for c, _, _ in found])[nearest]
         least[rows] = np.maximum(distance[np.arange(len(nearest)), nearest], 0.0)
 
-    for _ in in_order(part, range(0, len(x), _BLOCK), threads):
-        pass
+    for_each(part, range(0, len(x), _BLOCK), threads)
     return label, least
 
 

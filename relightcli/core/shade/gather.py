@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -11,6 +12,8 @@ from numpy.typing import NDArray
 
 from relightcli.core.parts import in_parts
 from relightcli.core.sphere import cube
+
+Zeros = Callable[[tuple[int, ...], Any], NDArray[Any]]
 
 
 class Gather(NamedTuple):
@@ -99,6 +102,29 @@ def join(parts: list[Gather]) -> Gather:
         whole.append(np.concatenate(column))
         column.clear()
     return Gather(cells, np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), *whole)
+
+
+def collect(parts: Iterable[Gather], receivers: int, entries: int, zeros: Zeros) -> Gather:
+    """`join` where memory does not hold the parts: `receivers` and `entries` that they have together, and what makes
+    arrays from a shape and a type."""
+    start = np.zeros(receivers + 1, np.int64)
+    columns = [zeros((entries,), kind) for kind in (np.int32, np.int16, np.float32, np.float32)]
+    at = z = cells = 0
+    for part in parts:
+        n, more, cells = len(part.start) - 1, len(part.source), part.cells
+        start[at + 1 : at + n + 1] = z + part.start[1:]
+        for column, own in zip(columns, part[2:], strict=True):
+            column[z : z + more] = own
+        at, z = at + n, z + more
+    return Gather(cells, start, *columns)
+
+
+def pick(gather: Gather, rows: NDArray[np.int64]) -> Gather:
+    """The entries of some receivers, (M,), which become 0 to M - 1."""
+    counts = gather.start[rows + 1] - gather.start[rows]
+    start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    index = np.repeat(gather.start[rows] - start[:-1], counts) + np.arange(start[-1])
+    return Gather(gather.cells, start, *(column[index] for column in gather[2:]))
 
 
 def replace_rows(gather: Gather, rows: NDArray[np.int64], part: Gather) -> Gather:
