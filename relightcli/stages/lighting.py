@@ -28,8 +28,9 @@ from relightcli.stages.precompute_config import BASES, MOST_BOUNCES
 from relightcli.stages.rig_store import read_rigs
 
 if TYPE_CHECKING:
+    from relightcli.adapters.scratch import Scratch
     from relightcli.core.shade.bounces import Exit
-    from relightcli.core.shade.gather import Gather, Zeros
+    from relightcli.core.shade.gather import Gather
     from relightcli.core.shade.lobe_factors import LobeFactors
 
 IN_MEMORY = 1 << 30  # visibility up to this size stays in memory between frames
@@ -528,14 +529,19 @@ class LightingStore:
             self._gathered[first] = join([part for _, part in self._gathers(first, len(self), step)])
         return self._gathered[first]
 
-    def gather_into(self, zeros: Zeros) -> Gather:
-        """`gather` in arrays that `zeros` makes, part by part; for what memory need not hold."""
+    def gather_into(self, scratch: Scratch) -> Gather:
+        """`gather` in arrays of `scratch`, part by part; for what memory need not hold."""
         from relightcli.core.shade.gather import collect
+
+        def parts() -> Iterator[Gather]:
+            for _, part in self._some_gathers(0, len(self)):
+                yield part
+                scratch.let_go()
 
         hits: Any = self.store.array("bounce/hit")
         step = hits.chunks[0]
         entries = sum(int(np.count_nonzero(hits[a : a + step])) for a in range(0, len(self), step))
-        return collect((part for _, part in self._some_gathers(0, len(self))), len(self), entries, zeros)
+        return collect(parts(), len(self), entries, scratch.zeros)
 
     def _gathers(self, first: int, last: int, step: int) -> Iterator[tuple[int, Gather]]:
         """Who sees whom, of the receivers from `first` to `last`, at most `step` at a time; with each part's first."""

@@ -82,7 +82,7 @@ class TransferSetup:
         self.texture = lighting.tint()
         self.lamps = LAMP_COLUMNS if scene.lights else 0
         outgrown = lighting.hit_bytes() > IN_MEMORY
-        gather = lighting.gather_into(self.scratch.zeros) if outgrown else lighting.gather()
+        gather = lighting.gather_into(self.scratch) if outgrown else lighting.gather()
         if gather is None:
             raise StoreError(f"{lighting.store.path}: nothing blocks anything in it; there are no interreflections")
         self.gather = gather
