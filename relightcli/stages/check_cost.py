@@ -7,6 +7,7 @@ goes with the receivers.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import cast
@@ -18,12 +19,24 @@ from relightcli.adapters.rays import Tracer
 from relightcli.run.accounting import Meter
 from relightcli.scene.model import Geometry, Scene
 from relightcli.stages.lighting import LightingStore
-from relightcli.stages.measured_error import MORE, STRIP, Draft, Judge, Sky, Strips, check_skies, check_views, rows_of
+from relightcli.stages.measured_error import (
+    MORE,
+    SAMPLES,
+    STRIP,
+    Draft,
+    Judge,
+    Sky,
+    Strips,
+    check_skies,
+    check_views,
+    rows_of,
+)
 from relightcli.stages.precompute_config import Config
 from relightcli.stages.promise import Tried, camera_of
 
 Costs = dict[str, float]
 KEYS = ("seconds", "cpu_seconds")
+MANY = 8  # times the least paths are traced, to see what passes take beside their paths
 
 
 @dataclass(frozen=True)
@@ -73,6 +86,12 @@ def _light(lighting: LightingStore, scene: Scene, sky: Sky, eye: np.ndarray, bou
     return meter.read()
 
 
+def _trace(judge: Judge, strips: Strips, sky: Sky, bounces: int, times: int) -> Costs:
+    meter = Meter()
+    judge.trace(strips, sky, judge.scene.materials, bounces + MORE, 0, samples=times * SAMPLES)
+    return meter.read()
+
+
 def predict_check(
     only: str | None, scene: Scene, source: Geometry, bounces: int, tried: Sequence[Tried], light: LightCosts | None
 ) -> Costs:
@@ -83,15 +102,17 @@ def predict_check(
     cameras, skies = check_views(scene, source, only), check_skies()
     middle = cameras[0].size[1] // 2
     rows = (max(0, middle - STRIP // 2), middle + max(1, STRIP // 2))
-    meter = Meter()
-    judge.trace(Strips(cameras[0], [rows], []), next(iter(skies.values())), scene.materials, bounces + MORE, 0)
-    taken = meter.read()
+    strips, sky = Strips(cameras[0], [rows], []), next(iter(skies.values()))
+    few, many = (_trace(judge, strips, sky, bounces, number) for number in (1, MANY))
     pixels = sum(sum(b - a for a, b in rows_of(c)) * c.size[0] for c in cameras)
-    times = 2 * len(skies) * pixels / ((rows[1] - rows[0]) * cameras[0].size[0])
-    if tried:
-        times *= tried[-1].passes
+    parts = 2 * len(skies) * pixels / ((rows[1] - rows[0]) * cameras[0].size[0])
+    times = tried[-1].times if tried else 1.0
     pictures = len(skies) * len(cameras)
-    out = {key: times * taken[key] for key in KEYS}
+    out = {}
+    for key in KEYS:
+        each = max(0.0, many[key] - few[key]) / (MANY - 1)
+        once = max(0.0, few[key] - each)
+        out[key] = parts * (times * each + (1.0 + math.log2(times)) * once)
     for key in KEYS:
         if tried:
             out[key] += pictures * tried[-1].lit[key]

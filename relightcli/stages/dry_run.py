@@ -66,7 +66,7 @@ def dry_run(prepared: Prepared, account: Account, settings: dict[str, Any]) -> d
         sum(cost[key] for cost in account.steps.values()) + start[key] for key in ("seconds", "cpu_seconds")
     )
     notes = list(prepared.geometry.notes)
-    if prepared.faces == "whole":
+    if prepared.decided.faces == "whole":
         notes.append(
             "large faces stay whole; should that miss the tolerance at the end, they are cut, which takes more"
         )

@@ -34,8 +34,9 @@ from relightcli.stages.lighting import LightingStore, together
 
 PIXELS = 2048  # of a picture that are compared, about
 STRIP = 4  # rows that are taken together, so that outlines are found
-SAMPLES = 8  # paths a pixel and pass, in each of the two runs
-MOST_PASSES = 8  # where one does not tell
+SAMPLES = 8  # paths a pixel that are traced at least, in each of the two runs
+MOST_TIMES = 64  # as many of them, where those do not tell
+MISSED = 16  # as many at least before anything counts as missed: rare bright paths make few of them look sure of it
 TELLS = 0.5  # of the error to keep: bounds that lie nearer to each other are near enough
 TURN, LIFT = 12.0, 7.0  # degrees from a camera of the scene to a view of the check: round the target, and up
 STEEPEST = 80.0  # degrees above the target to which a view is lifted
@@ -259,9 +260,15 @@ class _Memory(dict[str, Any]):
 
 @dataclass
 class _Run:
-    """Pixels summed over the passes that were traced."""
+    """Pixels of what was traced: `times` SAMPLES paths each, in `passes` passes that double what there was before.
+
+    A pass's points are stratified, so that its error falls faster than with the root of their number: passes are
+    weighted with the square of it.
+    """
 
     total: NDArray[np.float64] = field(default_factory=lambda: np.zeros(()))
+    weight: float = 0.0
+    times: int = 0
     passes: int = 0
 
 
@@ -306,31 +313,34 @@ class Judge:
                 ours = view.pixels(light.diffuse, light.specular)
                 where = f"camera {view.camera.name}, {name}{', edited' if number % len(changes) else ''}"
                 keys = [(view.camera, name, number % len(changes), truth, run) for run in (seed, seed + 1)]
-                passes = 1
+                times = 1
                 while True:
-                    a, b = (self._mean(key, passes, view, sky, materials) for key in keys)
+                    a, b = (self._mean(key, times, view, sky, materials) for key in keys)
                     share = share_of(ours - a, ours - b, a, b, where)
-                    clear = not share.least <= most < share.bound or share.bound - share.least <= TELLS * most
-                    if clear or passes >= MOST_PASSES:
+                    missed = share.least > most and times >= MISSED
+                    clear = missed or share.bound <= most or share.bound - share.least <= TELLS * most
+                    if clear or times >= MOST_TIMES:
                         break
-                    passes *= 2
+                    times *= 2
                 worst = larger(worst, share)
         return worst
 
     def _mean(
         self,
         key: tuple[Camera, str, int, int, int],
-        passes: int,
+        times: int,
         view: Strips,
         sky: Sky,
         materials: dict[str, Material],
     ) -> NDArray[np.float64]:
-        """A run's pixels, of `passes` passes at least; it goes on where it stopped."""
+        """A run's pixels, of that many times SAMPLES paths at least; it goes on where it stopped."""
         run = self.traced.setdefault(key, _Run())
-        if run.passes < passes:
-            run.total = run.total + self.trace(view, sky, materials, key[3], key[4], (run.passes, passes))
-            run.passes = passes
-        return run.total / run.passes
+        while run.times < times:
+            more = max(1, run.times)
+            found = self.trace(view, sky, materials, key[3], key[4], run.passes, more * SAMPLES)
+            run.total, run.weight = run.total + more**2 * found, run.weight + more**2
+            run.times, run.passes = run.times + more, run.passes + 1
+        return run.total / run.weight
 
     def trace(
         self,
@@ -339,14 +349,15 @@ class Judge:
         materials: dict[str, Material],
         bounces: int,
         seed: int,
-        passes: tuple[int, int] = (0, 1),
+        number: int = 0,
+        samples: int = SAMPLES,
     ) -> NDArray[np.float64]:
-        """The strips' pixels, (n, 3), summed over some passes of one run."""
+        """The strips' pixels, (n, 3), of pass `number` of a run."""
         shading = shading_scene(self.geometry, list(materials.values()), self.scene.lights.values())
         environment = make_latlong(sky)
-        out = []
+        out, passes = [], (number, number + 1)
         for rows in view.rows:
-            tile = trace_rows(shading, self.tracer, environment, view.camera, rows, passes, SAMPLES, bounces, seed)
+            tile = trace_rows(shading, self.tracer, environment, view.camera, rows, passes, samples, bounces, seed)
             out.append(tile.layers.sum(axis=0).reshape(-1, 3))
         return np.concatenate(out)
 

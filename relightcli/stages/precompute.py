@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import relight_formats as formats
 from relightcli import __version__
@@ -22,7 +22,7 @@ from relightcli.stages.lay_out import make_job, put_scene
 from relightcli.stages.pose_job import simulate_poses
 from relightcli.stages.precompute_config import Config
 from relightcli.stages.prepare import Prepared, prepare
-from relightcli.stages.promise import keep_promise, keep_promise_moving, need_reach
+from relightcli.stages.promise import UNDECIDED, Decided, keep_promise, keep_promise_moving, need_reach
 from relightcli.stages.promise_moving import choose_fields
 from relightcli.stages.visibility_job import block_size, create_outputs
 
@@ -36,28 +36,26 @@ def precompute(config: Config) -> dict[str, Any]:
     before = time.process_time() + children_seconds()
     need_output(config.output, store=True)
     run.need_scheduler(None if config.dry_run else config.scheduler)
-    result = None
-    faces = None if config.tolerance is None or config.overwrite else _decided(config.output)
-    while result is None:
-        result = _precompute(config, started, account, faces)
-        faces = "cut"
+    decided = UNDECIDED if config.tolerance is None or config.overwrite else _decided(config.output)
+    while isinstance(result := _precompute(config, started, account, decided), Decided):
+        decided = result
     if result.get("status") not in ("written", "resumed"):
         return result
     return {**result, "cpu_seconds": time.process_time() + children_seconds() - before}
 
 
-def _decided(output: Path) -> str | None:
-    """What an earlier run, finished or not, has decided about large faces."""
+def _decided(output: Path) -> Decided:
+    """What an earlier run, finished or not, has decided."""
     for settings in (lambda: formats.open_store(output).settings, lambda: formats.progress(output)["settings"]):
-        with contextlib.suppress(formats.RelightError, OSError, ValueError):
-            return cast("str | None", settings().get("faces"))
-    return None
+        with contextlib.suppress(formats.RelightError, OSError, ValueError, TypeError):
+            found = settings()
+            return Decided(found.get("faces"), max(1.0, float(found.get("care", 1.0))))
+    return UNDECIDED
 
 
-def _precompute(config: Config, started: float, account: Account, faces: str | None) -> dict[str, Any] | None:
-    """`precompute`; None where large faces that were kept whole have missed the tolerance. faces: as `prepare` has
-    it."""
-    prepared = prepare(config, account, faces)
+def _precompute(config: Config, started: float, account: Account, decided: Decided) -> dict[str, Any] | Decided:
+    """`precompute`; where the tolerance was missed, what to try again with."""
+    prepared = prepare(config, account, decided)
     if config.dry_run:
         return dry_run(prepared, account, _settings(prepared))
     inputs = scene_inputs(scene := prepared.scene)
@@ -131,22 +129,10 @@ def _precompute(config: Config, started: float, account: Account, faces: str | N
                 keep_promise_moving(config, prepared.promise, scene, source, writer)
         elif prepared.checked and prepared.promise is not None:
             with account.step("check"):
-                kept = keep_promise(
-                    prepared.config,
-                    prepared.promise,
-                    prepared.resolution,
-                    prepared.finer_helps,
-                    scene,
-                    source,
-                    geometry,
-                    receivers,
-                    buried,
-                    writer,
-                    prepared.faces,
-                )
-            if not kept:
+                again = keep_promise(prepared, receivers, buried, writer)
+            if again is not None:
                 writer.abandon()
-                return None
+                return again
         writer.commit(summary(account, started, resumed, config.workers))
     return _summary(config, started, resumed, geometry)
 
@@ -172,8 +158,10 @@ def _settings(prepared: Prepared) -> dict[str, Any]:
         settings["fields"] = config.fields.as_json()
     if prepared.promise is not None:
         settings["tolerance"] = prepared.promise
-    if prepared.faces is not None:
-        settings["faces"] = prepared.faces
+    if prepared.decided.faces is not None:
+        settings["faces"] = prepared.decided.faces
+    if prepared.decided.care != 1.0:
+        settings["care"] = prepared.decided.care
     if config.basis == "haar":
         settings |= {"coefficients": config.coefficients, "tolerance": config.tolerance}
     if "pose" in prepared.simulated:

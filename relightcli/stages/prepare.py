@@ -25,7 +25,7 @@ from relightcli.stages.fields import Moving, add_points, find_movers, place, wit
 from relightcli.stages.inputs import named_files, stamps
 from relightcli.stages.measured_error import Judge
 from relightcli.stages.precompute_config import RESOLUTION, Config, check_bounces, check_config
-from relightcli.stages.promise import Tried, choose, direct_keeps, try_settings
+from relightcli.stages.promise import UNDECIDED, Decided, Tried, choose, direct_keeps, try_settings
 from relightcli.stages.promise_moving import rungs
 from relightcli.stages.receiver_setup import (
     PixelReceivers,
@@ -59,7 +59,7 @@ class Prepared:
     resolution: int = RESOLUTION
     tried: tuple[Tried, ...] = ()  # settings, each with its error
     read: dict[Path, tuple[int, int, int]] = field(default_factory=dict)  # `stamps` of the scene's files before that
-    faces: str | None = None  # "whole" or "cut", where the tolerance decides about faces too large to carry shadows
+    decided: Decided = UNDECIDED  # `faces` where the tolerance decides about those too large to carry shadows
 
     @property
     def simulated(self) -> list[str]:
@@ -79,6 +79,12 @@ class Prepared:
     def finer_helps(self) -> bool:
         """Whether a finer resolution of light could bring the error down, as far as was tried."""
         return not self.tried or self.resolution == self.tried[-1].resolution
+
+    @property
+    def trial_share(self) -> float | None:
+        """What direct light errs by with these settings in the trial; None where they were not tried."""
+        of_chosen = (t for t in self.tried if (t.resolution, t.grid) == (self.resolution, self.config.grid))
+        return next((t.error.share for t in of_chosen), None)
 
     @property
     def posed(self) -> tuple[int, ...]:
@@ -130,9 +136,9 @@ class Prepared:
         return vertices, buried, (0,)
 
 
-def prepare(config: Config, account: Account, faces: str | None = None) -> Prepared:
-    """Reads the scene and decides. faces: "whole" or "cut", as an earlier run has decided. Raises InputError where
-    settings do not go with the scene."""
+def prepare(config: Config, account: Account, decided: Decided = UNDECIDED) -> Prepared:
+    """Reads the scene and decides. decided: by earlier attempts. Raises InputError where settings do not go with the
+    scene."""
     check_config(config)
     asked = effects.parse_effects(config.effects)
     wanted = effects.bounces_asked(asked, config.bounces)
@@ -194,6 +200,7 @@ def prepare(config: Config, account: Account, faces: str | None = None) -> Prepa
         promise,
         config.light_resolution or RESOLUTION,
         read=read,
+        decided=replace(decided, faces=None),
     )
     on_pixels = config.receivers != "vertices"
     may_stay = promise is not None and not on_pixels and moving is None and prepared.checked and uncut is not source
@@ -207,19 +214,21 @@ def prepare(config: Config, account: Account, faces: str | None = None) -> Prepa
             asked = config if grid == config.grid else replace(config, pixel_grid=grid)
             return replace(own, config=asked).receivers()[:2]
 
+        most = decided.direct(promise)
         with account.step("resolution"):
-            tried = try_settings(config, judge, own.geometry, receivers_of, promise)
-        chosen = choose(tried, promise)
+            tried = try_settings(config, judge, own.geometry, receivers_of, most)
+        chosen = choose(tried, most)
         changed = replace(config, pixel_grid=chosen.grid) if on_pixels else config
         return replace(own, config=changed, resolution=chosen.resolution, tried=tuple(tried))
 
     if not may_stay:
         return tried_with(prepared)
-    if faces != "cut":
-        whole = tried_with(replace(prepared, uncut=source, geometry=source, faces="whole"))
-        if faces == "whole" or direct_keeps(whole.tried, promise):
+    if decided.faces != "cut":
+        kept = replace(decided, faces="whole")
+        whole = tried_with(replace(prepared, uncut=source, geometry=source, decided=kept))
+        if decided.faces == "whole" or direct_keeps(whole.tried, decided.direct(promise)):
             return whole
-    return tried_with(replace(prepared, faces="cut"))
+    return tried_with(replace(prepared, decided=replace(decided, faces="cut")))
 
 
 class _Pilot:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import mean, median
 from typing import TYPE_CHECKING, Any, cast
 
@@ -38,12 +38,31 @@ from relightcli.stages.receiver_setup import MOST_PIXEL_GRID, PixelReceivers
 if TYPE_CHECKING:
     from relightcli.core.transport.receivers import Receivers
     from relightcli.stages.precompute_config import Config
+    from relightcli.stages.prepare import Prepared
 
 RESOLUTIONS = (16, 32, 64, 128)  # to choose from
 GRIDS = (1, 2, 4, MOST_PIXEL_GRID)  # of receivers along a pixel's side, to choose from
 MOST_RECEIVERS = 5_000_000  # of a picture with a grid that is chosen: 4 x 4 in each of 640 x 480
 Receiving = Callable[[int], "tuple[Receivers | PixelReceivers, NDArray[np.bool_] | None]"]  # by grid of pixels
+LEAST = 0.01  # of the tolerance: errors of a trial below it say no more than that they are small
+AGAIN = 1.01  # times more care than before is worth another attempt: less comes from settings that stayed the same
 DIRECT = 0.8  # of the tolerance: what direct light may be off by; the square of the rest is for what is left out
+
+
+@dataclass(frozen=True)
+class Decided:
+    """What has come of earlier attempts to keep a tolerance: whether large faces stay "whole" or are "cut" (None: not
+    known yet), and how many times more direct light erred in the check than in the trial."""
+
+    faces: str | None = None
+    care: float = 1.0
+
+    def direct(self, promise: float) -> float:
+        """What direct light may be off by in the trial."""
+        return DIRECT * promise / self.care
+
+
+UNDECIDED = Decided()
 
 
 def _strips(
@@ -70,19 +89,17 @@ def camera_of(config: Config) -> str | None:
 @dataclass(frozen=True)
 class Tried:
     """A resolution of light and, of receivers on pixels, their grid; the error of direct light with them; the seconds
-    and cpu_seconds that the light of a picture takes; passes of path tracing that it took to tell, in the mean."""
+    and cpu_seconds that the light of a picture takes; how many times the least paths it took to tell, in the mean."""
 
     resolution: int
     grid: int
     error: pilot.Share
     lit: dict[str, float]
-    passes: float
+    times: float
 
 
-def try_settings(
-    config: Config, judge: Judge, geometry: Geometry, receivers_of: Receiving, promise: float
-) -> list[Tried]:
-    """Errors of direct light by grid of pixels and resolution, up to what will do, in the pilot's views.
+def try_settings(config: Config, judge: Judge, geometry: Geometry, receivers_of: Receiving, most: float) -> list[Tried]:
+    """Errors of direct light by grid of pixels and resolution, up to one of at most `most`, in the pilot's views.
     judge: of the scene as it is; geometry: the mesh that receivers are on.
 
     What was asked for is all that is tried of it. A finer grid is tried from the coarsest resolution on that was as
@@ -99,11 +116,11 @@ def try_settings(
     for grid in grids:
         receivers, buried = receivers_of(grid)
         judge.lit.clear()
-        found = _try_resolutions(config, judge, geometry, receivers, buried, resolutions, DIRECT * promise)
+        found = _try_resolutions(config, judge, geometry, receivers, buried, resolutions, most)
         lit = {key: median(one[key] for one in judge.lit) for key in ("seconds", "cpu_seconds")}
-        passes = mean(run.passes for run in judge.traced.values())
-        out += [Tried(resolution, grid, error, lit, passes) for resolution, error in found]
-        if out[-1].error.share <= DIRECT * promise:
+        times = mean(run.times for run in judge.traced.values())
+        out += [Tried(resolution, grid, error, lit, times) for resolution, error in found]
+        if out[-1].error.share <= most:
             break
         least = min(error.share for _, error in found)
         first = next(resolution for resolution, error in found if error.share <= (1.0 + GAIN) * least)
@@ -139,17 +156,16 @@ def _try_resolutions(
     )
 
 
-def choose(tried: list[Tried], promise: float) -> Tried:
-    """The coarsest settings whose direct light is near enough; where none is, the coarsest that are as good as any:
-    what is wrong then does not come from them, and finer ones would only cost."""
-    least = min(one.error.share for one in tried)
-    most = max(DIRECT * promise, (1.0 + GAIN) * least)
+def choose(tried: list[Tried], most: float) -> Tried:
+    """The coarsest settings whose direct light errs by at most `most`; where none does, the coarsest that are as good
+    as any: what is wrong then does not come from them, and finer ones would only cost."""
+    most = max(most, (1.0 + GAIN) * min(one.error.share for one in tried))
     return next(one for one in tried if one.error.share <= most)
 
 
-def direct_keeps(tried: Sequence[Tried], promise: float) -> bool:
-    """Whether any of the settings keeps its part of the tolerance."""
-    return any(one.error.share <= DIRECT * promise for one in tried)
+def direct_keeps(tried: Sequence[Tried], most: float) -> bool:
+    """Whether direct light errs by at most `most` with any of the settings."""
+    return any(one.error.share <= most for one in tried)
 
 
 def need_reach(config: Config, promise: float, scene: Scene, tried: Sequence[Tried], finer_helps: bool) -> None:
@@ -205,42 +221,43 @@ def _keep(writer: formats.Writer, found: pilot.Share, promise: float) -> None:
 
 
 def keep_promise(
-    config: Config,
-    promise: float,
-    resolution: int,
-    finer_helps: bool,
-    scene: Scene,
-    source: Geometry,
-    geometry: Geometry,
+    prepared: Prepared,
     receivers: Receivers | PixelReceivers,
     buried: NDArray[np.bool_] | None,
     writer: formats.Writer,
-    faces: str | None = None,
-) -> bool:
-    """Measures the error of what was made and keeps it with it; raises NumericalError where it is too large. False
-    where it is, and faces that were kept "whole" have not been cut yet.
+) -> Decided | None:
+    """Measures the error of what was made and keeps it with it. None where that will do; else with what to try again;
+    raises NumericalError where nothing is left to try.
 
-    finer_helps: it is not known that a finer resolution of light would change nothing.
+    Tried again is with large faces cut, if they were not, and then with settings that will do if direct light errs in
+    the same proportion to the trial's.
     """
+    config, promise, source = prepared.config, prepared.promise, prepared.source
+    assert promise is not None
     lighting = LightingStore(cast("formats.Store", Draft(writer)), config.workers)
-    judge = Judge(scene, source, Tracer(source.positions, source.faces))
-    strips = _strips(scene, geometry, receivers, buried, check_views(scene, source, camera_of(config)))
+    judge = Judge(prepared.scene, source, Tracer(source.positions, source.faces))
+    views = check_views(prepared.scene, source, camera_of(config))
+    strips = _strips(prepared.scene, prepared.geometry, receivers, buried, views)
     skies = check_skies()
     bounces = lighting.bounces
-    edit = edit_of(scene.materials, set(scene.materials))
+    edit = edit_of(prepared.scene.materials, set(prepared.scene.materials))
     found = judge.error(lighting, strips, skies, bounces, bounces + MORE, edit, promise)
     _keep(writer, found, promise)
     if found.share <= promise:
-        return True
-    if faces == "whole":
-        return False
+        return None
+    if prepared.decided.faces == "whole":
+        return Decided("cut")
     if config.allow_miss:
-        return True
+        return None
     direct = judge.error(lighting, strips, skies, 0, 0, None, DIRECT * promise)
     if direct.share <= DIRECT * promise:
         knob = f"--bounces {bounces + 1}, a finer --bounce-resolution, or a finer mesh to bounce light off"
     else:
-        knob = _sharper(config, scene, resolution, finer_helps)
+        tried = prepared.trial_share
+        care = 0.0 if tried is None else direct.share / max(tried, LEAST * promise)
+        if care > AGAIN * prepared.decided.care:
+            return replace(prepared.decided, care=care)
+        knob = _sharper(config, prepared.scene, prepared.resolution, prepared.finer_helps)
     raise NumericalError(
         f"{config.output}: the error is {found.share:.2%} ({found.where}; of direct light {direct.share:.2%}), more "
         f"than the tolerance of {promise:.2%}. What would help: {knob}. The work is kept in "

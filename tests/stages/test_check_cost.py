@@ -51,7 +51,7 @@ def test_light_grows_with_the_receivers():
 
 
 def test_every_picture_of_the_check_has_the_light_of_interreflections(config, monkeypatch):
-    monkeypatch.setattr(Judge, "trace", lambda *_: np.zeros((1, 3)))
+    monkeypatch.setattr(Judge, "trace", lambda *_, **__: np.zeros((1, 3)))
     prepared = prepare(config, Account())
     tried = [Tried(16, 1, NOTHING, both(0.25), 1.0)]
     light = LightCosts(both(100.0), both(3.0), both(7.0))

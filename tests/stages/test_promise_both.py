@@ -75,7 +75,7 @@ def test_both_keep_it(transfer):
 
 
 def test_a_miss_names_both(transfer, monkeypatch):
-    monkeypatch.setattr(measured_error, "MOST_PASSES", 1)  # far off is far off
+    monkeypatch.setattr(measured_error, "MOST_TIMES", 1)  # far off is far off
     with pytest.raises(NumericalError, match=r"more than the tolerance of 0\.20%.*--pose-.*--field-order 5"):
         fit(transfer, "miss.zarr", tolerance=0.002)
 

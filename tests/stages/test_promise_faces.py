@@ -1,15 +1,19 @@
-"""precompute --tolerance and faces that are too large to carry shadows: whole where that keeps it, else cut."""
+"""precompute --tolerance tries again: faces that are too large to carry shadows are whole where that keeps it, else
+cut; settings that a trial has promised too much of get finer."""
 
 from __future__ import annotations
 
 import pytest
 
 import relight_formats as formats
+from relightcli.errors import NumericalError
 from relightcli.scene.model import Camera
 from relightcli.stages import precompute as stage
 from relightcli.stages import prepare as preparing
+from relightcli.stages import promise
 from relightcli.stages.precompute import precompute
 from relightcli.stages.precompute_config import Config
+from relightcli.stages.promise import Decided
 from tests.core.transport.scenes import lambert, sphere, square
 from tests.stages.scene_files import write_scene
 from tests.stages.test_precompute import array_bytes
@@ -84,10 +88,41 @@ def test_they_are_cut_where_only_the_check_says_so(coarse, tmp_path, monkeypatch
     output = tmp_path / "t.zarr"
     with pytest.raises(KeyboardInterrupt):
         run(coarse, output, tolerance=0.15)
-    assert checks == [False, True]
+    assert checks == [Decided("cut"), None]
     told, store = run(coarse, output, tolerance=0.15)  # goes on with the cut ones
     assert len(checks) == 3
     assert told["status"] == "resumed"
     assert store.settings == usual.settings
     assert array_bytes(output) == array_bytes(tmp_path / "usual.zarr")
     assert run(coarse, output, tolerance=0.15)[0]["status"] == "up to date"
+
+
+def test_a_trial_that_promised_too_much_is_tried_again_with_more_care(fine, tmp_path, monkeypatch):
+    """As where no sky of the trial shines in where one of the check does."""
+    smooth = {"overcast": promise.check_skies()["overcast"]}
+    monkeypatch.setattr(promise, "trial_skies", lambda: smooth)
+    settings = {"tolerance": 0.03, "light_resolution": None, "bounces": 2, "receivers": "pixels:main"}
+    checks = []
+    keep = stage.keep_promise
+
+    def checked(*arguments):
+        checks.append(keep(*arguments))
+        if len(checks) == 2:
+            raise KeyboardInterrupt
+        return checks[-1]
+
+    monkeypatch.setattr(stage, "keep_promise", checked)
+    with pytest.raises(KeyboardInterrupt):
+        run(fine, tmp_path / "t.zarr", **settings)
+    told, store = run(fine, tmp_path / "t.zarr", **settings)
+    assert told["status"] == "resumed"
+    assert checks[0].care > 1.0
+    assert checks[1:] == [None, None]
+    assert store.settings["care"] == checks[0].care
+    tried = [(one["light_resolution"], one["pixel_grid"]) for one in store.attrs["tried"]]
+    chosen = store.settings["light_resolution"], store.settings.get("pixel_grid", 1)
+    assert tried.index(chosen) > 0  # the trial takes the first to be enough
+    assert store.attrs["measured_error"]["share"] <= 0.03
+    assert run(fine, tmp_path / "t.zarr", **settings)[0]["status"] == "up to date"
+    with pytest.raises(NumericalError, match="What would help"):  # nothing finer is left to try
+        run(fine, tmp_path / "no.zarr", **{**settings, "light_resolution": 16, "pixel_grid": 1})

@@ -62,7 +62,7 @@ def test_the_tolerance_of_precompute_is_kept_in_other_poses(transfer):
 
 
 def test_a_miss_is_told_and_may_be_allowed(transfer, capsys, monkeypatch):
-    monkeypatch.setattr(measured_error, "MOST_PASSES", 1)  # far off is far off
+    monkeypatch.setattr(measured_error, "MOST_TIMES", 1)  # far off is far off
     output = transfer.parent / "miss.zarr"
     assert run_command(["fit-pose", str(transfer), "-o", str(output), "--tolerance", "0.001", "--workers", "1"]) == 4
     told = capsys.readouterr().err
