@@ -195,23 +195,23 @@ def _light_basis(setup: TransferSetup, tolerance: float, seed: int) -> tuple[NDA
         tensors[:, :, own] = setup.gather_rows(picked, sources, ORDER).reshape(len(picked), -1, CELLS * CELLS)
         del sources
     half = max(1, len(picked) // 2)
-    rows = tensors[:half].reshape(-1, cells)
-    gram = np.zeros((cells, cells))
+    values, vectors = gram_spectrum(_gram(tensors[:half].reshape(-1, cells), setup.threads))
+    left = np.sqrt(np.maximum(0.0, 1.0 - np.cumsum(values) / max(values.sum(), 1e-300)))
+    rank = int(np.argmax(left <= tolerance)) + 1 if (left <= tolerance).any() else len(values)
+    basis = np.ascontiguousarray(vectors[:, :rank], np.float32)
+    gram = _gram((tensors[half:] if len(picked) > half else tensors).reshape(-1, cells), setup.threads)
+    norm2, kept = float(np.trace(gram)), float(np.einsum("cl,cd,dl->", basis, gram, basis, optimize=True))
+    return basis, float(np.sqrt(max(0.0, 1.0 - kept / norm2))) if norm2 else 0.0
+
+
+def _gram(rows: NDArray[np.float32], threads: int) -> NDArray[np.float64]:
+    """rows' rows, (D, D), in float64."""
 
     def square(first: int) -> NDArray[np.float64]:
         part = rows[first : first + (1 << 14)].astype(np.float64)
         return part.T @ part
 
-    for part in in_order(square, range(0, len(rows), 1 << 14), setup.threads):
-        gram += part
-    values, vectors = gram_spectrum(gram)
-    left = np.sqrt(np.maximum(0.0, 1.0 - np.cumsum(values) / max(values.sum(), 1e-300)))
-    rank = int(np.argmax(left <= tolerance)) + 1 if (left <= tolerance).any() else len(values)
-    basis = np.ascontiguousarray(vectors[:, :rank], np.float32)
-    rest = tensors[half:] if len(picked) > half else tensors
-    norm2 = float((rest.astype(np.float64) ** 2).sum())
-    kept = float(((rest.reshape(-1, cells) @ basis).astype(np.float64) ** 2).sum())
-    return basis, float(np.sqrt(max(0.0, 1.0 - kept / norm2))) if norm2 else 0.0
+    return sum(in_order(square, range(0, len(rows), 1 << 14), threads), np.zeros((rows.shape[1],) * 2))
 
 
 def _sketch(setup: TransferSetup, config: Config) -> NDArray[np.float32]:

@@ -94,8 +94,12 @@ class TransferSetup:
 
     def seen_from(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         """The receivers whose light some others reflect, rising."""
-        seen = np.unique(pick(self.gather, rows).source)
-        return np.unique(np.concatenate([seen, self.partner[seen]]))
+        seen = np.zeros(len(self.row), bool)
+        for start in range(0, len(rows), SOME):
+            sources = pick(self.gather, rows[start : start + SOME]).source
+            seen[sources] = seen[self.partner[sources]] = True
+            self.scratch.let_go()
+        return np.flatnonzero(seen)
 
     def sources(self, basis: NDArray[np.float32], only: NDArray[np.int64] | None = None) -> Sources:
         """Responses to the lights of `basis` (6 CELLS^2, L), the lamps' columns after them.
