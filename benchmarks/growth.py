@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.asset import metal_scene
 from benchmarks.processes import run_tool
 from benchmarks.report import Report, Table, at_most
 from benchmarks.scenes import Setting, two_skies, write_scene
@@ -63,14 +64,10 @@ def measure(setting: Setting) -> Report:
     _add(report, "precompute over vertices", "vertices", sizes, over_vertices)
     _add(report, "cluster --lights 250 over vertices", "vertices", (few, middle, sizes[-1]), lights)
     _add(report, "relight over frames", "frames", counts, frames)
-    more = (few, middle) if setting.quick else (few, 30_000, middle)
-    _add(
-        report,
-        "precompute with one interreflection over vertices",
-        "vertices",
-        more,
-        [_simulate(setting, n, (*BOUNCED, "16")) for n in more],
-    )
+    ends = (few, middle, sizes[-1])
+    bounced, groups = zip(*(_bounced(setting, n) for n in ends), strict=True)
+    _add(report, "precompute with one interreflection, a metal, over vertices", "vertices", ends, list(bounced))
+    _add(report, "cluster of its receivers over vertices", "vertices", ends, list(groups))
     resolutions = (16, 32) if setting.quick else (16, 32, 64, 128)
     points = [_simulate(setting, few, (*SHADOWS, str(r))) for r in resolutions]
     _add(report, "precompute over texels along a face", "texels", resolutions, points)
@@ -83,7 +80,12 @@ def measure(setting: Setting) -> Report:
     _add(report, f"factorize over adjustable materials of {BALLS} balls", "materials", numbers, list(assets))
     movers = [_fields(setting, number) for number in numbers]
     _add(report, f"precompute over how many of {BALLS} balls can be moved", "movers", numbers, movers)
-    for what, found in (("precompute", over_vertices), ("cluster of lights", lights)):
+    for what, found in (
+        ("precompute", over_vertices),
+        ("cluster of lights", lights),
+        ("precompute with one interreflection", bounced),
+        ("cluster of receivers", groups),
+    ):
         report.rows.append(
             at_most(f"{what}: peak of a process at {sizes[-1]:,} vertices", found[-1][3], "GB", MOST_PEAK)
         )
@@ -100,6 +102,16 @@ def _simulate(setting: Setting, vertices: int, options: tuple[str, ...]) -> Poin
     store = setting.work / "growth.zarr"
     shutil.rmtree(store, ignore_errors=True)
     return _run(store, "precompute", scene, "-o", store, *options)
+
+
+def _bounced(setting: Setting, vertices: int) -> tuple[Point, Point]:
+    """`precompute` of one interreflection of an adjustable metal, and `cluster` of what that leaves."""
+    transfer, clusters = (setting.work / f"{name}.zarr" for name in ("growth-metal", "growth-groups"))
+    for store in (transfer, clusters):
+        shutil.rmtree(store, ignore_errors=True)
+    scene, _ = metal_scene(setting, vertices)
+    made = _run(transfer, "precompute", scene, "-o", transfer, *BOUNCED, "8")
+    return made, _run(clusters, "cluster", transfer, "-o", clusters)
 
 
 def _cluster(setting: Setting) -> Point:

@@ -25,7 +25,16 @@ from relightcli.errors import NumericalError
 from relightcli.stages.asset import AssetStore
 from relightcli.stages.left_over import DIRECT, RANKS, LeftOver
 from relightcli.stages.lighting import LightingStore
-from relightcli.stages.measured_error import MORE, Draft, Judge, check_skies, check_views, edit_of, vertex_strips
+from relightcli.stages.measured_error import (
+    MORE,
+    Draft,
+    Judge,
+    check_skies,
+    check_views,
+    edit_of,
+    trial_skies,
+    vertex_strips,
+)
 from relightcli.stages.transfer_setup import TransferSetup
 
 COEFFICIENTS = (24, 48, 96, 192, 384, 768)
@@ -50,7 +59,7 @@ def coefficients_for(lighting: LightingStore, left: LeftOver) -> int:
     count = len(lighting)
     some = np.unique(np.linspace(0, count - 1, min(count, RECEIVERS)).astype(int))
     bits, normals = lighting.bits_of(some), lighting.normal[some]
-    skies = [splat(latlong_to_cube(sky, lighting.resolution, 0.0)) for sky in check_skies().values()]
+    skies = [splat(latlong_to_cube(sky, lighting.resolution, 0.0)) for sky in trial_skies().values()]
     exact = [irradiance(bits, normals, moment_prefix(sky), lighting.threads) for sky in skies]
     even = LightFactors(np.full((2, 2, 1), 1.0 / np.pi, np.float32), np.ones(1, np.float32))
     most = 6 * lighting.resolution**2
