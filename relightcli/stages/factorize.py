@@ -28,7 +28,7 @@ from relightcli.errors import InputError, StoreError
 from relightcli.run.accounting import Account, Meter
 from relightcli.stages.budget import summary
 from relightcli.stages.choose_ranks import Ranks, coefficients_for, keep_asset_promise, tensor_ranks
-from relightcli.stages.cluster import copy_arrays
+from relightcli.stages.copying import copy_arrays
 from relightcli.stages.direct_tensors import put_direct
 from relightcli.stages.left_over import LeftOver, left_over
 from relightcli.stages.lighting import LightingStore

@@ -21,12 +21,13 @@ from typing import Any
 import relight_formats as formats
 from relightcli import __version__
 from relightcli.adapters.files import need_output
+from relightcli.core.parts import one_blas_thread
 from relightcli.core.pose.pose_model import MODELS, Errors, Report
 from relightcli.core.pose.zh_lobes import MOST_LOBES
 from relightcli.errors import InputError, StoreError
 from relightcli.run.accounting import Account
 from relightcli.stages.budget import summary
-from relightcli.stages.cluster import copy_arrays
+from relightcli.stages.copying import copy_arrays
 from relightcli.stages.measured_error import Draft
 from relightcli.stages.pose_cost import predict_fit
 from relightcli.stages.pose_fits import LEFT_OUT, SIZES, Fit, fit_object, lit_sides, put_arrays
@@ -44,6 +45,7 @@ from relightcli.stages.promise_pose import (
 KIND = "pose"
 
 
+@one_blas_thread()
 def fit_pose(config: Config) -> dict[str, Any]:
     """Runs the stage; returns a summary. Raises InputError, StoreError, NumericalError, OSError."""
     started, account = time.perf_counter(), Account()

@@ -31,7 +31,7 @@ from relightcli.errors import InputError, StoreError
 from relightcli.run import blocks as run
 from relightcli.run.accounting import Account, Meter
 from relightcli.stages.budget import summary
-from relightcli.stages.cluster import copy_arrays
+from relightcli.stages.copying import copy_arrays
 from relightcli.stages.light_cluster_job import DIFFUSE, LOBE, SCRATCH, ClusterJob, ClusterWorker, as_cell
 from relightcli.stages.light_cost import Work, predict_lights
 from relightcli.stages.light_factors import put_factors, shining

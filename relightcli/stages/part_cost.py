@@ -12,6 +12,7 @@ from typing import Any
 import relight_formats as formats
 from relightcli import __version__
 from relightcli.run.accounting import Account, Meter, children_seconds
+from relightcli.stages.copying import copy_arrays, make_like
 
 SMALL = 1 << 22  # bytes of arrays that are copied whole
 
@@ -84,8 +85,6 @@ def grown(part: Callable[[int], Costs], sizes: tuple[int, int], whole: int) -> C
 
 def copying(store: formats.Store, names: list[str], writer: formats.Writer) -> Costs:
     """Costs of copying those arrays: small ones are copied, of large ones a chunk of the largest."""
-    from relightcli.stages.cluster import copy_arrays, make_like
-
     out, sizes = Costs(), store.sizes()
     small = [name for name in names if sizes[name].raw <= SMALL]
     with out.timed():
