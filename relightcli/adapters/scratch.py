@@ -12,27 +12,33 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-LIMIT = 1 << 28  # bytes of an array that stays in memory
+LIMIT = 1 << 30  # bytes that stay in memory
+PAGES = 1 << 29  # bytes of files that may be in memory at a time
+_STATUS = Path("/proc/self/statm")
 
 
 class Scratch:
-    """Gives out arrays of zeros; those of more than `limit` bytes lie in files in `folder` (None: where the system
-    keeps temporary ones), which go with them.
+    """Gives out arrays of zeros; those that memory has no more of `limit` bytes for lie in files in `folder` (None:
+    where the system keeps temporary ones), which go with them.
 
-    `let_go` hands their pages back to the system, which keeps them as long as it has memory to spare, and on disk from
-    then on: what a process holds is what it has touched since the last call.
+    `let_go` hands their pages back to the system if they are more than `pages` bytes. The system keeps them as long as
+    it has memory to spare, and on disk from then on.
     """
 
-    def __init__(self, folder: Path | None = None, limit: int = LIMIT) -> None:
-        self.folder, self.limit = folder, limit
+    def __init__(self, folder: Path | None = None, limit: int = LIMIT, pages: int = PAGES) -> None:
+        self.folder, self.limit, self.pages = folder, limit, pages
+        self._held = 0
         self._maps: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
 
     def zeros(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
         """Raises OSError where the disk has no room: later it would end the process."""
         kind = np.dtype(dtype)
         size = int(np.prod(shape, dtype=np.int64)) * kind.itemsize
-        if size <= self.limit:
-            return np.zeros(shape, kind)
+        if self._held + size <= self.limit:
+            array = np.zeros(shape, kind)
+            self._held += size
+            weakref.finalize(array, self._freed, size)
+            return array
         with tempfile.TemporaryFile(dir=self.folder) as file:
             if hasattr(os, "posix_fallocate"):
                 os.posix_fallocate(file.fileno(), 0, size)
@@ -42,12 +48,18 @@ class Scratch:
         self._maps.add(mapped)
         return np.frombuffer(mapped, kind).reshape(shape)
 
+    def _freed(self, size: int) -> None:
+        self._held -= size
+
     @property
     def used(self) -> bool:
         """Whether any array lies in a file."""
         return len(self._maps) > 0
 
     def let_go(self) -> None:
+        if not self.used or not hasattr(mmap, "MADV_DONTNEED"):
+            return
+        if _STATUS.exists() and int(_STATUS.read_text().split()[2]) * mmap.PAGESIZE <= self.pages:
+            return
         for mapped in self._maps:
-            if hasattr(mmap, "MADV_DONTNEED"):
-                mapped.madvise(mmap.MADV_DONTNEED)
+            mapped.madvise(mmap.MADV_DONTNEED)

@@ -79,7 +79,7 @@ def test_arrays_that_outgrow_memory_change_nothing(transfer, clusters, asset, tm
 
     class Small(Scratch):
         def __init__(self, folder):
-            super().__init__(folder, limit=0)
+            super().__init__(folder, limit=0, pages=0)
             given.append(self)
 
         def let_go(self):
