@@ -31,14 +31,21 @@ class Scratch:
         self._maps: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
 
     def zeros(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-        """Raises OSError where the disk has no room: later it would end the process."""
+        """In memory or a file. Raises OSError where the disk has no room: later it would end the process."""
+        size = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        if self._held + size > self.limit:
+            return self.filed(shape, dtype)
+        array = np.zeros(shape, dtype)
+        self._held += size
+        weakref.finalize(array, self._freed, size)
+        return array
+
+    def filed(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+        """`zeros`, but in a file, unless there are no values."""
         kind = np.dtype(dtype)
         size = int(np.prod(shape, dtype=np.int64)) * kind.itemsize
-        if self._held + size <= self.limit:
-            array = np.zeros(shape, kind)
-            self._held += size
-            weakref.finalize(array, self._freed, size)
-            return array
+        if size == 0:
+            return np.zeros(shape, kind)
         with tempfile.TemporaryFile(dir=self.folder) as file:
             if hasattr(os, "posix_fallocate"):
                 os.posix_fallocate(file.fileno(), 0, size)

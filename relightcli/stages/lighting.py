@@ -530,7 +530,7 @@ class LightingStore:
         return self._gathered[first]
 
     def gather_into(self, scratch: Scratch) -> Gather:
-        """`gather` in arrays of `scratch`, part by part; for what memory need not hold."""
+        """`gather` in files of `scratch`, part by part; for what memory need not hold."""
         from relightcli.core.shade.gather import collect
 
         def parts() -> Iterator[Gather]:
@@ -541,7 +541,7 @@ class LightingStore:
         hits: Any = self.store.array("bounce/hit")
         step = hits.chunks[0]
         entries = sum(int(np.count_nonzero(hits[a : a + step])) for a in range(0, len(self), step))
-        return collect(parts(), len(self), entries, scratch.zeros)
+        return collect(parts(), len(self), entries, scratch.filed)
 
     def _gathers(self, first: int, last: int, step: int) -> Iterator[tuple[int, Gather]]:
         """Who sees whom, of the receivers from `first` to `last`, at most `step` at a time; with each part's first."""
