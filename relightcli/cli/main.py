@@ -94,10 +94,7 @@ def run(arguments: list[str]) -> int:
         error.show()
         return 2
     except (click.exceptions.Abort, KeyboardInterrupt):
-        click.echo(
-            "relightcli: interrupted; finished blocks are kept, run the same command again to continue", err=True
-        )
-        return INTERRUPTED
+        return _interrupted()
     except click.ClickException as error:
         error.show()
         return 2
@@ -106,6 +103,8 @@ def run(arguments: list[str]) -> int:
         _drop_stdout()
         return 0
     except BaseException as error:
+        if _by_signal(error):
+            return _interrupted()
         if verbose:
             import traceback
 
@@ -117,6 +116,18 @@ def run(arguments: list[str]) -> int:
         except OSError:  # the interpreter would try again at exit, and end with another code
             sys.stdout = open(os.devnull, "w")  # noqa: SIM115
         return code
+
+
+def _by_signal(error: BaseException | None) -> bool:
+    """Whether it comes of a signal: of one that arrives while compiled code returns, Python makes a SystemError."""
+    while isinstance(error, SystemError):
+        error = error.__cause__
+    return isinstance(error, KeyboardInterrupt)
+
+
+def _interrupted() -> int:
+    click.echo("relightcli: interrupted; finished blocks are kept, run the same command again to continue", err=True)
+    return INTERRUPTED
 
 
 def _occupy_closed_streams() -> None:

@@ -125,12 +125,24 @@ def test_errors_to_exit_codes(error, code, words, monkeypatch, capsys):
 
 
 def test_interrupt_is_130(monkeypatch, capsys):
-    def interrupt(*_, **__):
+    def interrupted(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli.group, "main", interrupt)
+    monkeypatch.setattr(cli.group, "main", interrupted)
     assert cli.run(["relight"]) == 130
     assert "interrupted" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("cause", "code"), [(KeyboardInterrupt(), 130), (ValueError(), 5), (None, 5)])
+def test_a_signal_that_compiled_code_returns_with_is_130(monkeypatch, capsys, cause, code):
+    """Python turns an exception of a signal handler that runs inside Numba's dispatcher into a SystemError."""
+
+    def returns(*arguments, **options):
+        raise SystemError("returned a result with an exception set") from cause
+
+    monkeypatch.setattr(cli.group, "main", returns)
+    assert cli.run(["relight"]) == code
+    assert ("interrupted" in capsys.readouterr().err) == (code == 130)
 
 
 def test_precompute_json(scene, store, tmp_path):
