@@ -46,6 +46,21 @@ def run(scene, output, **settings):
     return told, formats.open_store(output)
 
 
+def interrupted_at_the_second(monkeypatch):
+    """What checks have said, to be read later; after the second of them the run is interrupted."""
+    checks = []
+    keep = stage.keep_promise
+
+    def checked(*arguments):
+        checks.append(keep(*arguments))
+        if len(checks) == 2:
+            raise KeyboardInterrupt
+        return checks[-1]
+
+    monkeypatch.setattr(stage, "keep_promise", checked)
+    return checks
+
+
 def test_faces_stay_whole_where_that_will_do(fine, tmp_path):
     told, store = run(fine, tmp_path / "t.zarr", tolerance=0.3)
     assert store.settings["faces"] == "whole"
@@ -75,16 +90,7 @@ def test_they_are_cut_where_only_the_check_says_so(coarse, tmp_path, monkeypatch
     # As where interreflections want finer faces than direct light does.
     monkeypatch.setattr(preparing, "direct_keeps", lambda *_: True)
     monkeypatch.setattr(stage, "need_reach", lambda *_: None)
-    checks = []
-    keep = stage.keep_promise
-
-    def checked(*arguments):
-        checks.append(keep(*arguments))
-        if len(checks) == 2:
-            raise KeyboardInterrupt
-        return checks[-1]
-
-    monkeypatch.setattr(stage, "keep_promise", checked)
+    checks = interrupted_at_the_second(monkeypatch)
     output = tmp_path / "t.zarr"
     with pytest.raises(KeyboardInterrupt):
         run(coarse, output, tolerance=0.15)
@@ -102,16 +108,7 @@ def test_a_trial_that_promised_too_much_is_tried_again_with_more_care(fine, tmp_
     smooth = {"overcast": promise.check_skies()["overcast"]}
     monkeypatch.setattr(promise, "trial_skies", lambda: smooth)
     settings = {"tolerance": 0.03, "light_resolution": None, "bounces": 2, "receivers": "pixels:main"}
-    checks = []
-    keep = stage.keep_promise
-
-    def checked(*arguments):
-        checks.append(keep(*arguments))
-        if len(checks) == 2:
-            raise KeyboardInterrupt
-        return checks[-1]
-
-    monkeypatch.setattr(stage, "keep_promise", checked)
+    checks = interrupted_at_the_second(monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         run(fine, tmp_path / "t.zarr", **settings)
     told, store = run(fine, tmp_path / "t.zarr", **settings)

@@ -33,7 +33,7 @@ def test_parts_are_hardly_worse_than_the_whole(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setattr(groups, "TOGETHER", 900)
     label, left_of_parts = groups.grouped(rows, clusters, 0, 2)
     assert label.dtype == np.int32
-    assert left_of_parts < 1.2 * left
+    assert left_of_parts < 1.2 * left  # measured: 0.33 times (every part has a group) and 1.08 times
     for found in (whole, label):
         sizes = np.bincount(found)
         assert sizes.min() > 0
@@ -45,7 +45,7 @@ def test_blocks_of_rows_change_no_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     label = np.zeros(500, np.int32)
     expected = groups.split_large(rows, label, 70)
     monkeypatch.setattr(groups, "TOGETHER", 64)
-    assert (groups.split_large(rows, label, 70) == expected).mean() > 0.99  # but for ties within rounding
+    np.testing.assert_array_equal(groups.split_large(rows, label, 70), expected)
 
 
 def test_no_rows_that_differ() -> None:
