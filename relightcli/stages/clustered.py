@@ -25,7 +25,7 @@ from relightcli.core.brdf.models import SPECULAR, MaterialTable, widen
 from relightcli.core.lights.bright_cells import bright_cells, cut
 from relightcli.core.lights.environment import latlong_to_cube
 from relightcli.core.lights.leaf_light import LeafLight, Splitter
-from relightcli.core.lights.points import Points, both, split_points
+from relightcli.core.lights.points import Points, Rows, both, row_light, split_points
 from relightcli.core.lights.quadtree import Tree, build_tree, first_leaves, leaves_at, solid_angles
 from relightcli.core.shade.cluster_sum import Fractions, Lobes
 from relightcli.core.shade.seen_points import point_irradiance, point_lobes
@@ -124,7 +124,7 @@ class ClusteredStore(LightingStore):
         if self._lobes is None:
             specular = self._shine(environment, rotate, coats, view, looked_at)
         else:
-            specular = self._lobes.shine(sky, coats, view) * colour
+            specular = self._lobes.shine(sky, coats, view, colour)
         if lamps is not None:
             specular += lamps * colour
         return Radiance(diffuse, specular)
@@ -185,12 +185,13 @@ class _Cut:
 
     def __init__(self, runs: Runs, cells: NDArray[np.int32], error: NDArray[np.float32], resolution: int) -> None:
         self.runs, self.cells, self.error, self.resolution = runs, cells, error, resolution
+        self.flux = np.zeros((0, 3))  # of the cells, under the last light
         self._known: tuple[NDArray[Any], ...] = ()
         self._parts = Points(np.zeros((0, 3)), np.zeros((0, 3)))
 
     def of(self, light: LeafLight, rest: NDArray[np.float32], rotate: float) -> tuple[NDArray[np.int64], Points]:
         """Bright cells under the light of a map, and their parts: the last ones if their light has not changed."""
-        flux = self.runs.sum(light.flux)
+        flux = self.flux = self.runs.sum(light.flux)
         bright = bright_cells(flux, self.error)
         known = (bright, flux[bright], self.runs.sums(light.moment, bright), np.array([*rest.shape, rotate]))
         if not same(known, self._known):
@@ -229,6 +230,8 @@ class ClusteredSky:
         self.changed: int | None = None
         self._given: tuple[NDArray[np.float32], float] | None = None
         self._rest: NDArray[np.float32] | None = None
+        self._rows: Rows | None = None
+        self._taken = np.zeros(0, np.int64)
         self._splitter: tuple[tuple[int, int, float], Splitter] | None = None
         self._tracer: Tracer | None = None
         self._seen: dict[bytes, NDArray[np.bool_]] = {}
@@ -246,23 +249,24 @@ class ClusteredSky:
         if self._given is not None and self._given[0] is environment and self._given[1] == rotate:
             self.changed = 0
             return
-        rest, self.points, _ = split_points(environment, rotate)
-        splitter = self._splitter_of(rest.shape[0], rest.shape[1], rotate)
-        threads, old = self.lighting.threads, self.light
-        if self._rest is not None and self._given is not None and self._given[1] == rotate and old is not None:
-            rows = changed_rows(self._rest, rest) if self._rest.shape == rest.shape else None
-        else:
-            rows = None
-        if rows is not None and old is not None and self._rest is not None:
-            gone, come = (splitter.light(m, threads, rows) for m in (self._rest, rest))
-            new = LeafLight(old.flux + (come.flux - gone.flux), old.moment + (come.moment - gone.moment))
-        else:
+        splitter = self._splitter_of(*environment.shape[:2], rotate)
+        threads, old, before = self.lighting.threads, self.light, self._given
+        if old is None or before is None or before[1] != rotate or before[0].shape != environment.shape:
+            self._rows = row_light(environment)
+            rest, self.points, taken = split_points(environment, rotate, self._rows)
             new = splitter.light(rest, threads)
-        self._given, self._rest, self.light = (environment, rotate), rest, new
+        else:
+            rows, columns = changes(before[0], environment)
+            self._rows = row_light(environment, self._rows, rows)
+            rest, self.points, taken = split_points(environment, rotate, self._rows)
+            _widen(columns, np.setxor1d(taken, self._taken, assume_unique=True))
+            more = splitter.light(rest, threads, columns, self._rest)
+            new = LeafLight(old.flux + more.flux, old.moment + more.moment)
+        self._given, self._rest, self._taken, self.light = (environment, rotate), rest, taken, new
         was = self.bright
         self.bright, self.parts = self.cut(self._cut)
         if old is not None:
-            changed = np.flatnonzero((new.moment != old.moment).any(axis=(1, 2)))
+            changed = np.unique(np.flatnonzero(new.moment != old.moment) // 9)
             if len(changed) <= PARTLY * len(new.moment):
                 runs = np.union1d(self.runs.of[changed], np.setxor1d(was, self.bright))
                 before, after = (
@@ -350,7 +354,7 @@ class ClusteredSky:
 
 
 class _BakedLobes:
-    """Specular light of the view that the clusters were made for, without the specular colours."""
+    """Specular light of the view that the clusters were made for."""
 
     def __init__(self, lighting: ClusteredStore, tree: Tree) -> None:
         self.lighting = lighting
@@ -395,8 +399,10 @@ class _BakedLobes:
                 "for other changes use the transfer store it came from"
             )
 
-    def shine(self, sky: ClusteredSky, coats: _Coats, view: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(N, 3). Raises InputError for another view, or other lobes than were baked in."""
+    def shine(
+        self, sky: ClusteredSky, coats: _Coats, view: NDArray[np.float32], colour: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """(N, 3), of a colour (N, 3). Raises InputError for another view, or other lobes than were baked in."""
         lighting = self.lighting
         if self._good is None or self._good[0] is not coats or self._good[1] is not view:
             self._check(coats, view)
@@ -404,7 +410,7 @@ class _BakedLobes:
         assert sky.light is not None
         if self._of is not sky.light:
             bright, self._parts = sky.cut(self._cut)
-            flux = self.runs.sum(sky.light.flux).copy()
+            flux = self._cut.flux.copy()
             flux[bright] = 0.0
             old = np.zeros_like(flux) if self._flux is None else self._flux
             changed = np.flatnonzero((flux != old).any(axis=1))
@@ -415,7 +421,7 @@ class _BakedLobes:
             self._of, self._flux = sky.light, flux
         points = both(sky.points, self._parts)
         if not len(points.flux):
-            return self.lobes.put(self._even, None, self.rows, len(lighting))
+            return self.lobes.put(self._even, None, self.rows, colour)
         if self._apart is None or not same(self._apart[0], points):
             more = point_lobes(
                 np.concatenate([sky.seen(sky.points), sky.visible(self._parts)]),
@@ -428,7 +434,7 @@ class _BakedLobes:
                 lighting.threads,
             )
             self._apart = (points, more)
-        return self.lobes.put(self._even, self._apart[1], self.rows, len(lighting))
+        return self.lobes.put(self._even, self._apart[1], self.rows, colour)
 
 
 def same(one: Sequence[NDArray[Any]], other: Sequence[NDArray[Any]]) -> bool:
@@ -445,25 +451,34 @@ def _without(light: LeafLight, cells: NDArray[np.bool_] | NDArray[np.int64]) -> 
     return LeafLight(flux, moment)
 
 
-def changed_rows(old: NDArray[np.float32], new: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Per column of two maps (H, W, 3) the range of rows that differ, (W, 2), half open; empty where none do."""
-    rows = np.zeros((old.shape[1], 2), np.int64)
-    _changed_rows(np.ascontiguousarray(old), np.ascontiguousarray(new), rows)
-    return rows
+def changes(old: NDArray[np.float32], new: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The rows (k,) in which two maps (H, W, 3) differ, and per column the range of rows that do, (W, 2), half open;
+    empty where none do."""
+    unlike, columns = np.zeros(len(old), bool), np.zeros((old.shape[1], 2), np.int64)
+    _changes(np.ascontiguousarray(old), np.ascontiguousarray(new), unlike, columns)
+    return np.flatnonzero(unlike), columns
+
+
+def _widen(columns: NDArray[np.int64], pixels: NDArray[np.int64]) -> None:
+    """Takes flat indices of a map's pixels into the ranges of rows (W, 2) of its columns."""
+    for row, column in zip(*(k.tolist() for k in np.divmod(pixels, len(columns))), strict=True):
+        first, last = columns[column]
+        columns[column] = (row, row + 1) if first == last else (min(first, row), max(last, row + 1))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _changed_rows(old, new, rows):  # type: ignore[no-untyped-def]
+def _changes(old, new, unlike, columns):  # type: ignore[no-untyped-def]
     width = old.shape[1]
     for i in range(old.shape[0]):
         one, other = old[i].reshape(3 * width), new[i].reshape(3 * width)
-        unlike = 0
+        differ = 0
         for k in range(3 * width):  # without a branch: most rows are alike
-            unlike |= one[k] != other[k]
-        if not unlike:
+            differ |= one[k] != other[k]
+        if not differ:
             continue
+        unlike[i] = True
         for j in range(width):
             if old[i, j, 0] != new[i, j, 0] or old[i, j, 1] != new[i, j, 1] or old[i, j, 2] != new[i, j, 2]:
-                if rows[j, 1] == 0:
-                    rows[j, 0] = i
-                rows[j, 1] = i + 1
+                if columns[j, 1] == 0:
+                    columns[j, 0] = i
+                columns[j, 1] = i + 1

@@ -71,7 +71,8 @@ class _Coats:
 
     def diffuse(self, e: NDArray[np.float32]) -> NDArray[np.float32]:
         """Diffuse exit radiance, (N, 3), of an irradiance (N, 3)."""
-        out: NDArray[np.float32] = e * self.albedo * np.float32(1.0 / np.pi)
+        out: NDArray[np.float32] = e * self.albedo
+        out *= np.float32(1.0 / np.pi)
         if self.partner is not None:
             out += e[self.partner] * self.through * np.float32(1.0 / np.pi)
         return out

@@ -328,6 +328,25 @@ def test_windows_come_and_go_without_a_trace(clustered, tmp_path):
     np.testing.assert_allclose(first, second, rtol=1e-6, atol=1e-12)
 
 
+def test_lamp_that_a_sun_outshines_returns_to_the_map(clustered):
+    """What is a point depends on all light: an edit can change it far from where the map was changed."""
+    dim = np.full((256, 512, 3), 0.01, np.float32)
+    dim[60, 100] = 300.0
+    sun = dim.copy()
+    sun[90, 400] = 1e5
+    lighting, points = ClusteredStore(clustered, 1), []
+    for sky in (dim, sun, dim, sun):
+        fresh = ClusteredStore(clustered, 1)
+        for store in (lighting, fresh):
+            store.sky.set_light(sky, 20.0)
+        np.testing.assert_allclose(lighting.sky.light.moment, fresh.sky.light.moment, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(lighting.sky.lit(), fresh.sky.lit(), rtol=1e-6, atol=1e-9)
+        points.append({tuple(d) for d in lighting.sky.points.direction.tolist()})
+    assert points[0]
+    assert points[1]
+    assert not points[0] & points[1]
+
+
 def test_edit_changes_its_clusters_only(clustered):
     lighting = ClusteredStore(clustered, 1)
     sky = smooth_map()

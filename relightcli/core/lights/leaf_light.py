@@ -44,14 +44,19 @@ class Splitter:
         self._row_half_angles = 0.5 * (np.arcsin(edges) + edges * np.sqrt(np.maximum(0.0, 1.0 - edges**2)))
 
     def light(
-        self, radiance: NDArray[np.float32], threads: int = 1, rows: NDArray[np.int64] | None = None
+        self,
+        radiance: NDArray[np.float32],
+        threads: int = 1,
+        rows: NDArray[np.int64] | None = None,
+        less: NDArray[np.float32] | None = None,
     ) -> LeafLight:
         """Light of the leaves under a map.
 
-        rows (W, 2): the rows of each column, half open, that count; the others are as black. None: all. The sums do not
-        depend on `threads`.
+        rows (W, 2): the rows of each column, half open, that count; the others are as black. None: all. less: a map of
+        the same size that is taken off it, pixel by pixel. The sums do not depend on `threads`.
         """
         source = np.ascontiguousarray(radiance, np.float32)
+        off = np.zeros((0, 0, 3), np.float32) if less is None else np.ascontiguousarray(less, np.float32)
         if rows is None:
             rows = np.tile(np.array([0, self.height]), (self.width, 1))
         strips = np.flatnonzero(rows[self._column, 1] > rows[self._column, 0])
@@ -62,7 +67,7 @@ class Splitter:
         def walk(first: int, last: int) -> None:
             for band, out in zip(bands[first:last], parts[first:last], strict=True):
                 _walk(
-                    source, band, self._column, self._borders, south, self.tree,
+                    source, off, band, self._column, self._borders, south, self.tree,
                     self._row_edges, self._row_half_angles, half_angles_table(), out,
                 )  # fmt: skip
 
@@ -98,7 +103,7 @@ def _strips(width: int, turn: float, tree: Tree) -> tuple[NDArray[np.int64], NDA
 
 
 @njit(cache=True, nogil=True)
-def _walk(radiance, strips, columns, borders, south, tree, row_edges, row_half_angles, table, out):  # type: ignore[no-untyped-def]
+def _walk(radiance, off, strips, columns, borders, south, tree, row_edges, row_half_angles, table, out):  # type: ignore[no-untyped-def]
     room = 6 * tree.resolution + 8
     edges, half_angles, leaves = np.empty(room), np.empty(room), np.empty(room, np.int64)
     light = np.empty((len(row_edges) - 1, 3))
@@ -110,7 +115,7 @@ def _walk(radiance, strips, columns, borders, south, tree, row_edges, row_half_a
         rows = (south[column, 0], south[column, 1])
         if column != held:
             held = column
-            _take_column(radiance, column, rows, light)
+            _take_column(radiance, off, column, rows, light)
         count = _meridian(tree, math.sin(middle), math.cos(middle), table, edges, half_angles, leaves)
         _merge_strip(
             light, rows, row_edges, row_half_angles, edges, half_angles, leaves, count, middle, high - low, out
@@ -118,11 +123,14 @@ def _walk(radiance, strips, columns, borders, south, tree, row_edges, row_half_a
 
 
 @njit(cache=True, nogil=True)
-def _take_column(radiance, column, rows, light):  # type: ignore[no-untyped-def]
-    """Pixels of a column of a map (H, W, 3), from rows[0] to rows[1] counted from the south pole, to light (H, 3)."""
+def _take_column(radiance, off, column, rows, light):  # type: ignore[no-untyped-def]
+    """Pixels of a column of a map (H, W, 3), from rows[0] to rows[1] counted from the south pole, to light (H, 3); less
+    those of another map, if it has any."""
     for row in range(rows[0], rows[1]):
         for c in range(3):
             light[row, c] = radiance[len(light) - 1 - row, column, c]
+            if len(off):
+                light[row, c] -= off[len(light) - 1 - row, column, c]
 
 
 @njit(cache=True, nogil=True)

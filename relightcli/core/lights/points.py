@@ -36,19 +36,37 @@ def both(one: Points, other: Points) -> Points:
     return Points(*(np.concatenate(pair) for pair in zip(one, other, strict=True)))
 
 
+class Rows(NamedTuple):
+    """Luminance of the flux of every row of a map, and of its brightest pixel's radiance, (H,) float64."""
+
+    flux: NDArray[np.float64]
+    peak: NDArray[np.float64]
+
+
+def row_light(radiance: NDArray[np.float32], known: Rows | None = None, rows: NDArray[np.int64] | None = None) -> Rows:
+    """Light of the rows of a map (H, W, 3). rows (k,): those in which it differs from the map that `known` is of."""
+    height, width = radiance.shape[:2]
+    found = Rows(np.empty(height), np.empty(height)) if known is None else Rows(known.flux.copy(), known.peak.copy())
+    chosen = np.arange(height) if known is None or rows is None else rows
+    _row_light(np.ascontiguousarray(radiance, np.float32), texel_solid_angles(height, width), chosen, *found)
+    return found
+
+
 def split_points(
-    radiance: NDArray[np.float32], rotate_degrees: float = 0.0
+    radiance: NDArray[np.float32], rotate_degrees: float = 0.0, light: Rows | None = None
 ) -> tuple[NDArray[np.float32], Points, NDArray[np.int64]]:
     """A map (H, W, 3) without its points, the points as they lie after a turn by `rotate_degrees` about +Y, and the
-    flat indices of the pixels that went into them. The map is returned as it is if there are none."""
+    flat indices of the pixels that went into them, rising. The map is returned as it is if there are none.
+
+    light: that of its rows, if it is known.
+    """
     height, width = radiance.shape[:2]
     none = Points(np.zeros((0, 3)), np.zeros((0, 3)))
     if math.pi / height > WIDEST or 2.0 * math.pi / width > WIDEST:
         return radiance, none, np.zeros(0, np.int64)
     solid = texel_solid_angles(height, width)
     source = np.ascontiguousarray(radiance, np.float32)
-    rows, peaks = np.empty(height), np.empty(height)
-    _row_flux(source, solid, rows, peaks)
+    rows, peaks = row_light(source) if light is None else light
     least = LEAST * float(rows.sum())
     # The mean over a texel and the pixels on its rim: if it has enough, one of them is as bright.
     level = least / (16.0 * math.pi / (6 * RESOLUTION**2) + solid)
@@ -118,15 +136,14 @@ def _luminance(flux: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @njit(cache=True, nogil=True)
-def _row_flux(radiance, solid, rows, peaks):  # type: ignore[no-untyped-def]
-    """Luminance of the flux of every row, and of its brightest pixel's radiance."""
-    for i in range(radiance.shape[0]):
-        total, peak = 0.0, np.float32(0.0)
+def _row_light(radiance, solid, chosen, flux, peak):  # type: ignore[no-untyped-def]
+    for i in chosen:
+        total, most = 0.0, np.float32(0.0)
         for j in range(radiance.shape[1]):
             y = _luminance_of(radiance, i, j)
             total += y
-            peak = max(peak, y)
-        rows[i], peaks[i] = total * solid[i], peak
+            most = max(most, y)
+        flux[i], peak[i] = total * solid[i], most
 
 
 @njit(cache=True, nogil=True)

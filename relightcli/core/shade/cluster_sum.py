@@ -190,21 +190,20 @@ def _spread(height, reach, steep):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
 def _add_all(place, mixed, normal, clusters, light, alike, mean, flux, radius, out):  # type: ignore[no-untyped-def]
-    whole, sums = np.empty((3, 3)), np.empty((3, GROUP))
+    whole, sums, own = np.empty((3, 3)), np.empty((3, GROUP)), np.empty(len(clusters), np.int32)
     for g in range(len(place)):
-        nothing = True
-        for j in range(len(clusters)):
-            if place[g, clusters[j]] != NONE:
-                nothing = False
-                break
-        if nothing:
+        some = False
+        for j in range(len(clusters)):  # without a branch: places are far apart
+            own[j] = place[g, clusters[j]]
+            some |= own[j] != NONE
+        if not some:
             continue
         whole[:] = 0.0
         sums[:] = 0.0
         x, y, z = normal[g, 0], normal[g, 1], normal[g, 2]
         red, green, blue = sums[0], sums[1], sums[2]
         for j in range(len(clusters)):
-            p = place[g, clusters[j]]
+            p = own[j]
             if p == NONE:
                 continue
             if p == ALL:
@@ -262,22 +261,27 @@ class Lobes:
         )
 
     def put(
-        self, groups: NDArray[np.float64], more: NDArray[np.float64] | None, rows: NDArray[np.int64], count: int
+        self,
+        groups: NDArray[np.float64],
+        more: NDArray[np.float64] | None,
+        rows: NDArray[np.int64],
+        colour: NDArray[np.float32],
     ) -> NDArray[np.float32]:
-        """Specular light by groups (G, 3, 64) plus `more` (n, 3), at the `rows` (n,) of (count, 3); not below 0."""
-        out = np.zeros((count, 3), np.float32)
-        _put(groups, np.zeros((0, 3)) if more is None else more, rows, out)
+        """Specular light by groups (G, 3, 64) plus `more` (n, 3), not below 0, times the colour (N, 3) of the `rows`
+        (n,) of all; (N, 3)."""
+        out = np.zeros(colour.shape, np.float32)
+        _put(groups, np.zeros((0, 3)) if more is None else more, rows, colour, out)
         return out
 
 
 @njit(cache=True, nogil=True)
-def _put(groups, more, rows, out):  # type: ignore[no-untyped-def]
+def _put(groups, more, rows, colour, out):  # type: ignore[no-untyped-def]
     for j in range(len(rows)):
         for c in range(3):
             value = groups[j // GROUP, c, j % GROUP]
             if len(more):
                 value += more[j, c]
-            out[rows[j], c] = np.float32(max(value, 0.0))
+            out[rows[j], c] = np.float32(max(value, 0.0)) * colour[rows[j], c]
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")

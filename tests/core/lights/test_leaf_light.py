@@ -9,7 +9,7 @@ import pytest
 
 from relightcli.core.lights import quadtree
 from relightcli.core.lights.environment import latlong_to_cube
-from relightcli.core.lights.leaf_light import leaf_light
+from relightcli.core.lights.leaf_light import Splitter, leaf_light
 from relightcli.core.sphere import cube as sphere
 from tests.core.lights.test_quadtree import random_leaves
 from tests.core.shade.skies import patchy_map, smooth_map
@@ -97,6 +97,17 @@ def test_leaves_that_an_edit_does_not_touch_keep_their_bits():
     changed = (before.moment != after.moment).any(axis=(1, 2))
     only = leaf_light(_spot(), tree, 10.0)
     np.testing.assert_array_equal(changed, (only.flux != 0).any(axis=1))
+
+
+def test_a_map_taken_off_another():
+    rng = np.random.default_rng(4)
+    one, other = rng.random((2, 40, 80, 3)).astype(np.float32)
+    splitter = Splitter(quadtree.build_tree(random_leaves(64, 5), 64), 40, 80, 20.0)
+    rows = np.sort(rng.integers(0, 41, (80, 2)), axis=1)
+    found = splitter.light(one, 2, rows, other)
+    for part, first, second in zip(found, splitter.light(one, 1, rows), splitter.light(other, 1, rows), strict=True):
+        np.testing.assert_allclose(part, first - second, rtol=1e-10, atol=1e-13)
+    assert not splitter.light(one, 2, rows, one).moment.any()
 
 
 def _spot():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from relightcli.core.lights.latlong import texel_solid_angles
-from relightcli.core.lights.points import MOST, split_points
+from relightcli.core.lights.points import MOST, row_light, split_points
 from relightcli.core.sphere import cube
 from tests.core.shade.skies import smooth_map
 
@@ -168,3 +168,16 @@ def test_a_sun_in_the_zenith():
     rest, points, _ = split_points(sky)
     assert points.flux.sum() > 0.99 * flux_of(sky).sum()
     np.testing.assert_allclose(points.flux.sum(0) + flux_of(rest), flux_of(sky), rtol=1e-9)
+
+
+def test_light_of_the_rows_that_changed():
+    rng = np.random.default_rng(6)
+    sky = rng.random((256, 512, 3)).astype(np.float32)
+    edited = sky.copy()
+    edited[[3, 200], [70, 5]] = 400.0
+    edited[9, 9] = 0.0
+    found = row_light(edited, row_light(sky), np.array([3, 9, 200]))
+    for part, whole in zip(found, row_light(edited), strict=True):
+        np.testing.assert_array_equal(part, whole)
+    for part, whole in zip(split_points(edited, 7.0, found), split_points(edited, 7.0), strict=True):
+        np.testing.assert_equal(part, whole)

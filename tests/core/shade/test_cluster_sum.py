@@ -123,10 +123,11 @@ def test_lobes():
     groups = lobes.dark()
     lobes.add(groups, chosen, flux, 1)
     placed = np.zeros((2 * N, 3))
-    placed[rows] = np.maximum(expected + more, 0.0)
-    np.testing.assert_allclose(lobes.put(groups, more, rows, 2 * N), placed, rtol=1e-6, atol=1e-9 * placed.max())
-    placed[rows] = expected
-    np.testing.assert_allclose(lobes.put(groups, None, rows, 2 * N), placed, rtol=1e-6)
+    colour = rng.random((2 * N, 3)).astype(np.float32)
+    placed[rows] = np.maximum(expected + more, 0.0) * colour[rows]
+    np.testing.assert_allclose(lobes.put(groups, more, rows, colour), placed, rtol=1e-6, atol=1e-9 * placed.max())
+    placed[rows] = expected * colour[rows]
+    np.testing.assert_allclose(lobes.put(groups, None, rows, colour), placed, rtol=1e-6)
 
 
 @pytest.mark.parametrize("count", [1, 63, 64, 65, 300])
