@@ -250,13 +250,13 @@ class ClusteredSky:
             self.changed = 0
             return
         splitter = self._splitter_of(*environment.shape[:2], rotate)
-        threads, old, before = self.lighting.threads, self.light, self._given
-        if old is None or before is None or before[1] != rotate or before[0].shape != environment.shape:
+        threads, old, given = self.lighting.threads, self.light, self._given
+        if old is None or given is None or given[1] != rotate or given[0].shape != environment.shape:
             self._rows = row_light(environment)
             rest, self.points, taken = split_points(environment, rotate, self._rows)
             new = splitter.light(rest, threads)
         else:
-            rows, columns = changes(before[0], environment)
+            rows, columns = changes(given[0], environment)
             self._rows = row_light(environment, self._rows, rows)
             rest, self.points, taken = split_points(environment, rotate, self._rows)
             _widen(columns, np.setxor1d(taken, self._taken, assume_unique=True))
