@@ -249,7 +249,7 @@ class ClusteredSky:
         if self._given is not None and self._given[0] is environment and self._given[1] == rotate:
             self.changed = 0
             return
-        splitter = self._splitter_of(*environment.shape[:2], rotate)
+        splitter = self._splitter_of(environment.shape[0], environment.shape[1], rotate)
         threads, old, given = self.lighting.threads, self.light, self._given
         if old is None or given is None or given[1] != rotate or given[0].shape != environment.shape:
             self._rows = row_light(environment)
