@@ -8,14 +8,16 @@ goes with the receivers.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 import relight_formats as formats
 from relightcli.adapters.rays import Tracer
+from relightcli.core.shade.gather import Gather
 from relightcli.run.accounting import Meter
 from relightcli.scene.model import Geometry, Scene
 from relightcli.stages.lighting import LightingStore
@@ -60,22 +62,59 @@ class LightCosts:
         )
 
 
-def measure_light(writer: formats.Writer, config: Config, scene: Scene, source: Geometry, bounces: int) -> LightCosts:
-    """Times the light of a picture with what the store has by now."""
+class _Begun(LightingStore):
+    """A store of which no more than some runs of receivers were traced. Where bits are read part by part no others are
+    visited: what the many others take, over and over, would hide what these do."""
+
+    def __init__(self, writer: formats.Writer, threads: int, runs: Sequence[slice]) -> None:
+        super().__init__(cast("formats.Store", Draft(writer)), threads)
+        self.runs = runs
+        self.kept = int(self.kept * sum(run.stop - run.start for run in runs) / max(1, len(self)))
+
+    def blocks(
+        self, first: int = 0, last: int | None = None, needed: NDArray[np.bool_] | None = None
+    ) -> Iterator[tuple[slice, NDArray[np.uint8]]]:
+        if self._bits is not None:
+            yield from super().blocks(first, last, needed)
+            return
+        for run in self.runs:
+            start, stop = max(run.start, first), min(run.stop, len(self) if last is None else last)
+            if start < stop:
+                yield from super().blocks(start, stop, needed)
+
+    def _gathers(self, first: int, last: int, step: int) -> Iterator[tuple[int, Gather]]:
+        cells, nothing = self.store.layouts["bounce/hit"].shape[2], np.zeros((2, 0), np.int32)
+        at = first
+
+        def unseen(stop: int) -> tuple[int, Gather]:
+            empty = nothing[0].astype(np.float32)
+            return at, Gather(
+                cells, np.zeros(stop - at + 1, np.int64), nothing[0], nothing[1].astype(np.int16), empty, empty
+            )
+
+        for start, part in super()._gathers(first, last, step):
+            if start > at:
+                yield unseen(start)
+            yield start, part
+            at = start + len(part.start) - 1
+        if at < last:
+            yield unseen(last)
+
+
+def measure_light(
+    writer: formats.Writer, config: Config, scene: Scene, source: Geometry, bounces: int, runs: Sequence[slice] = ()
+) -> LightCosts:
+    """Times the light of a picture with what the store has by now, the bits of some runs of receivers."""
     sky = next(reversed(check_skies().values()))
     eye = np.array(check_views(scene, source, camera_of(config))[0].eye)
-    _light(_open(writer, config), scene, sky, eye, bounces)  # kernels are loaded
-    lighting = _open(writer, config)
+    _light(_Begun(writer, config.workers, runs), scene, sky, eye, bounces)  # kernels are loaded
+    lighting = _Begun(writer, config.workers, runs)
     first, direct, whole = (_light(lighting, scene, sky, eye, number) for number in (bounces, 0, bounces))
     return LightCosts(
         direct,
         {key: max(0.0, whole[key] - direct[key]) for key in KEYS},
         {key: max(0.0, first[key] - whole[key]) for key in KEYS},
     )
-
-
-def _open(writer: formats.Writer, config: Config) -> LightingStore:
-    return LightingStore(cast("formats.Store", Draft(writer)), config.workers)
 
 
 def _light(lighting: LightingStore, scene: Scene, sky: Sky, eye: np.ndarray, bounces: int) -> Costs:

@@ -129,19 +129,17 @@ def _pilot(
         subprocess.run([sys.executable, "-c", f"import {VisibilityJob.__module__}"], check=True)
         others = (children_seconds() - before) * processes
     worker = job.open()
-    runs = -(-count // RUN)
-    chosen = np.unique(np.linspace(0, runs - 1, RUNS).round().astype(int))
-    worker.run(run.Block("first", int(chosen[0]) * RUN, min(count, (int(chosen[0]) + 1) * RUN)))
+    chosen = np.unique(np.linspace(0, -(-count // RUN) - 1, RUNS).round().astype(int))
+    runs = [slice(RUN * k, min(count, RUN * (k + 1))) for k in chosen.tolist()]
+    worker.run(run.Block("first", runs[0].start, runs[0].stop))
     first = begun.read()
     start["seconds"] += first["seconds"]
     start["cpu_seconds"] += processes * first["cpu_seconds"] + others  # each of them loads kernels
-    traced = 0
+    traced = sum(rows.stop - rows.start for rows in runs)
     costs: dict[str, float] = {}
-    for number in chosen:
-        block = run.Block(f"run/{number}", int(number) * RUN, min(count, (int(number) + 1) * RUN))
-        traced += block.stop - block.start
+    for number, rows in enumerate(runs):
         meter = Meter()
-        found = worker.run(block)
+        found = worker.run(run.Block(f"run/{number}", rows.start, rows.stop))
         whole = meter.read()
         # Light in another basis is no part of its own.
         for key in ("seconds", "cpu_seconds"):
@@ -159,7 +157,7 @@ def _pilot(
         spent["basis"] = np.array([0.0, share * costs["rest_seconds"], size, costs["rest_cpu_seconds"]])
     for cost in spent.values():
         cost *= count / traced
-    light = None if none is None else measure_light(*asked).grown(none, count / traced)
+    light = None if none is None else measure_light(*asked, runs).grown(none, count / traced)
     return spent, start, light
 
 

@@ -144,6 +144,7 @@ class LightingStore:
 
     apart = True
     streams = True
+    kept = IN_MEMORY  # bytes of what pixels see that are kept between frames
 
     def __init__(self, store: Path | formats.Store, threads: int) -> None:
         self.store = formats.open_store(store) if isinstance(store, Path) else store
@@ -492,10 +493,8 @@ class LightingStore:
             else:
                 yield Radiance(diffuse, specular if coats.shiny.any() else None)
         for at, seen in self._pixel_gathers() if first else ():
-            rows = slice(at, at + len(seen.start) - 1)
             for light, (e, specular) in zip(lights, arrived, strict=True):
-                more = send(seen, at, light, False)
-                e[rows], specular[rows] = more[0][rows], more[1][rows]
+                send(seen, at, light, False, (e, specular, lobe))
         for e, specular in arrived:
             yield Radiance(coats.diffuse(e), specular if coats.shiny.any() else None)
 
@@ -565,19 +564,19 @@ class LightingStore:
 
     def _pixel_gathers(self) -> Iterator[tuple[int, Gather]]:
         """Whom the receivers of pixels see, part by part; kept for the next frame if that takes no more than
-        IN_MEMORY."""
+        `kept`."""
         if self._seen is not None:
             yield from self._seen
             return
         kept, size = [], 0
         for at, part in self._some_gathers(0, self.pixels):
             size += part.source.nbytes + part.cell.nbytes + part.cosine.nbytes + part.solid_angle.nbytes
-            if size <= IN_MEMORY:
+            if size <= self.kept:
                 kept.append((at, part))
             else:
                 kept.clear()
             yield at, part
-        if size <= IN_MEMORY:
+        if size <= self.kept:
             self._seen = kept
 
     def tint(self) -> NDArray[np.float32] | None:

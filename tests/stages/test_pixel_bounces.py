@@ -10,8 +10,9 @@ from relightcli.core.measure.errors import relative_rmse
 from relightcli.errors import StoreError
 from relightcli.run import blocks as run
 from relightcli.scene.model import Camera, Material
-from relightcli.stages import lighting, visibility_job
+from relightcli.stages import check_cost, lighting, visibility_job
 from relightcli.stages import precompute as stage
+from relightcli.stages.lighting import LightingStore
 from relightcli.stages.precompute import precompute
 from relightcli.stages.precompute_config import Config
 from relightcli.stages.relight import Config as RelightConfig
@@ -134,11 +135,40 @@ def test_in_parts_and_in_frames(pixels, tmp_path, monkeypatch):
     monkeypatch.setattr(lighting, "ENTRIES", 100 * 6 * 16 * 16)
     parts = [frames("parts")]
     monkeypatch.setattr(lighting, "IN_MEMORY", 1000)
+    monkeypatch.setattr(lighting.LightingStore, "kept", 1000)
     parts.append(frames("lost"))
     for found in parts:
         for a, b in zip(found, whole, strict=True):
             for name in b:
                 np.testing.assert_array_equal(a[name], b[name])
+
+
+def test_begun_stores_light_what_was_traced(pixels, monkeypatch):
+    """As a dry run times them, part by part: whole as any store, of some runs these alone."""
+    monkeypatch.setattr(lighting, "IN_MEMORY", 0)
+    monkeypatch.setattr(check_cost, "Draft", lambda writer: writer)
+    store = formats.open_store(pixels)
+    whole = LightingStore(store, 1)
+
+    def shine(made):
+        view = np.tile(np.float32([0, 0.8, 0.6]), (len(made), 1))
+        return made.exit_radiance(smooth_map(), 20.0, made.scene.materials, view, None, None, 2)
+
+    expected = shine(whole)
+    for part, same in zip(shine(check_cost._Begun(store, 1, [slice(0, len(whole))])), expected, strict=True):
+        np.testing.assert_array_equal(part.diffuse, same.diffuse)
+        np.testing.assert_array_equal(part.specular, same.specular)
+    runs = [slice(64, 128), slice(500, 520), slice(whole.pixels - 30, len(whole))]
+    own = np.concatenate([np.arange(run.start, run.stop) for run in runs])
+    begun = check_cost._Begun(store, 1, runs)
+    assert begun.kept == int(LightingStore.kept * len(own) / len(whole))
+    found = shine(begun)
+    np.testing.assert_array_equal(found[0].specular[own], expected[0].specular[own])
+    for part in found[1:]:
+        lit = part.diffuse.any(axis=1)
+        assert lit[own].any()
+        lit[own] = False
+        assert not lit.any()
 
 
 def test_radiance_stores_hold_vertices_too(pixels, vertices, tmp_path):

@@ -14,6 +14,7 @@ what arrives, once per light factor, and sends it on weighted by the view factor
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -70,7 +71,7 @@ def bounce(
         lobes = light.lobe.shape if go_on else (0, *light.lobe.shape[1:])
         into = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32), np.zeros(lobes, np.float32)
     irradiance, specular, lobe = into
-    directions = cube.texel_directions(gather.cells).reshape(-1, 3)
+    directions = _directions(gather.cells)
     towards = np.zeros((n, 3), np.float32) if view is None else view
     looked_at = active if view is not None else np.zeros(n, bool)
 
@@ -98,6 +99,14 @@ def bounce(
 
     in_parts(part, len(gather.start) - 1, threads)
     return into
+
+
+@lru_cache(maxsize=4)
+def _directions(cells: int) -> NDArray[np.float64]:
+    """(6 C C, 3). Read-only: stores that memory does not hold come in many small parts."""
+    directions = cube.texel_directions(cells).reshape(-1, 3)
+    directions.flags.writeable = False
+    return directions
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
