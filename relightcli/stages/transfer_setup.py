@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,9 @@ COARSE = 2  # the same for two bounces
 LAMP_COLUMNS = 3  # the local lights' light, by colour, comes after the sky's cells
 FIT = 1024  # receivers at which lights are matched by the direct light that they give
 BLOCK = 512  # receivers whose tensors are gathered at a time
-SOME = 128  # the same where what they see lies in files
+SOME = 128  # receivers whose entries are read from files at a time
+TOUCHED = 1 << 29  # bytes of files that all threads may reach for at a time
+AROUND = 1 << 16  # bytes that the system brings with any
 SOURCES = 4096  # receivers whose light is taken at a time
 
 
@@ -177,12 +180,11 @@ class TransferSetup:
 
     def gather_rows(self, rows: NDArray[np.int64], sources: Sources, order: int) -> NDArray[np.float32]:
         """Transfer (len(rows), Q, S, L) of some receivers, `transfer.gather_transfer`."""
-        step = SOME if self.scratch.used else max(1, len(rows))
         parts = []
-        for start in range(0, len(rows), step):
+        for run in self._runs(rows, sources):
             parts.append(
                 gather_transfer(
-                    pick(self.gather, rows[start : start + step]),
+                    pick(self.gather, rows[run]),
                     0,
                     sources,
                     self.exits,
@@ -196,6 +198,21 @@ class TransferSetup:
             )
             self.scratch.let_go()
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    def _runs(self, rows: NDArray[np.int64], sources: Sources) -> Iterator[slice]:
+        """Runs of some receivers that reach for no more than TOUCHED bytes of what lies in files, if anything does."""
+        if not self.scratch.used or not len(rows):
+            yield slice(0, len(rows))
+            return
+        each = AROUND + sum(values.nbytes // max(1, len(values)) for values in (sources.even, sources.factor))
+        most = TOUCHED // (each * self.threads)  # clusters are compressed side by side
+        entries = np.cumsum(self.gather.start[rows + 1] - self.gather.start[rows])
+        start = 0
+        while start < len(rows):
+            before = int(entries[start - 1]) if start else 0
+            stop = max(start + 1, int(np.searchsorted(entries, before + most, side="right")))
+            yield slice(start, stop)
+            start = stop
 
     def second_sources(self, lights: Sources, order: int, only: NDArray[np.int64] | None = None) -> Sources:
         """What receivers gather of light that was reflected once: for each light of `lights` and channel, (l, q).

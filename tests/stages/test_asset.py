@@ -88,6 +88,7 @@ def test_arrays_that_outgrow_memory_change_nothing(transfer, clusters, asset, tm
 
     monkeypatch.setattr(transfer_setup, "Scratch", Small)
     monkeypatch.setattr(transfer_setup, "IN_MEMORY", 0)
+    monkeypatch.setattr(transfer_setup, "TOUCHED", 1 << 24)  # receivers come by a few
     cluster.cluster(cluster.Config(transfer, tmp_path / "clusters.zarr", CLUSTERS, workers=2))
     factorize.factorize(factorize.Config(clusters, tmp_path / "asset.zarr", workers=2))
     for expected in (clusters, asset):
