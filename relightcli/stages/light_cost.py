@@ -75,7 +75,7 @@ def predict_lights(lighting: LightingStore, copied: list[str], work: Work) -> tu
         out.add(copying(store, copied, whole))
         with out.timed():
             work.put_receivers(whole)
-        out.bytes += stored_bytes(whole, "light_clusters")
+        out.bytes += sum(stored_bytes(whole, group) for group in ("light_clusters", "light_factors"))
         once = Costs()
         with once.timed():
             tracer = Tracer(lighting.geometry.positions, lighting.geometry.faces) if work.job.shadows else None

@@ -300,6 +300,8 @@ def test_what_is_refused_and_predicted(transfer, tmp_path, capsys):
     written = formats.open_store(make(transfer)[0])  # there already
     kept = [name for name in written.names() if name.startswith("light_factors/") and name.endswith("/receiver")]
     assert told["shining_receivers"] == sum(written.layouts[name].shape[0] for name in kept) > 0
+    stored = sum(size.stored for size in written.sizes().values())
+    assert told["predicted"]["bytes"] == pytest.approx(stored, rel=0.2)
     assert not (transfer.parent / "no.zarr").exists()
     assert run(["cluster", str(transfer), "-o", str(tmp_path / "x.zarr"), "--light-factors", "--dry-run"]) == 0
     assert ", factors for " in capsys.readouterr().err
