@@ -35,6 +35,7 @@ from relightcli.stages.transfer_setup import CELLS, COARSE, LAMP_COLUMNS, cell_r
 Factors = NDArray[np.float32]
 
 ROWS = 128  # receivers of a matrix product: it stays in a core's memory, and on one thread
+TURNED = 1 << 16  # receivers whose rotations are made at a time
 
 
 class AssetStore(LightingStore):
@@ -247,11 +248,16 @@ class _Tensors:
         self.lobe_row = np.where(may_shine, np.cumsum(may_shine) - 1, -1).astype(np.int32)
         self.lobed_normal = np.ascontiguousarray(asset.normal[self.lobed])
         self.lobed_material = material[self.lobed].astype(np.int32)
-        rotations = local_rotations(asset.normal[receiver], asset.order)
-        self.even_weights = np.ascontiguousarray(even_projection(asset.order) @ rotations, np.float32)
         kept = np.flatnonzero(np.equal.outer(*[_bands(asset.order)] * 2).reshape(-1))  # a rotation keeps the band
-        turned = np.swapaxes(rotations[may_shine], 1, 2).reshape(-1, asset.order**4)  # column after column
-        self.rotations = np.ascontiguousarray(turned[:, kept])
+        self.even_weights = np.empty((len(receiver), asset.order**2), np.float32)
+        self.rotations = np.empty((len(self.lobed), len(kept)), np.float32)
+        for a in range(0, len(receiver), TURNED):
+            part = slice(a, a + TURNED)
+            rotations = local_rotations(asset.normal[receiver[part]], asset.order)
+            self.even_weights[part] = even_projection(asset.order) @ rotations
+            own = np.flatnonzero(may_shine[part])
+            turned = np.swapaxes(rotations[own], 1, 2).reshape(-1, asset.order**4)  # column after column
+            self.rotations[self.lobe_row[part][own]] = turned[:, kept]
         self.even: list[NDArray[np.float32]] = []
         self.light: list[NDArray[np.float32]] = []
         self.uniform: NDArray[np.float32] | None = None

@@ -20,7 +20,7 @@ from relightcli.core.transport.direct_tensor import direct_light, direct_transfe
 from relightcli.core.transport.lobe_visibility import lobe_visibility, table_side
 from relightcli.run.accounting import Meter
 from relightcli.stages.brdf_data import direct_model
-from relightcli.stages.family import Family, families_of, put_family
+from relightcli.stages.family import Family, Parts, families_of, put_family
 from relightcli.stages.lighting import LightingStore
 
 PLACE, MATTE = "direct", "matte"
@@ -142,10 +142,12 @@ class _Group:
     def __init__(self, lighting: LightingStore, name: str) -> None:
         read: Any = lighting.store.read
         self.receiver: NDArray[np.int32] = read(f"{PLACE}/{name}/receiver")
-        self.index, self.scale = read(f"{PLACE}/{name}/index"), read(f"{PLACE}/{name}/scale")
-        self.value = np.ascontiguousarray(read(f"{PLACE}/{name}/value").swapaxes(1, 2))
+        self.scale = read(f"{PLACE}/{name}/scale")
+        names = [f"{PLACE}/{name}/{leaf}" for leaf in ("index", "value")]
+        self.transfer = Parts(lighting.store, names, len(self.receiver), turned=True)
         self.family = None if name == MATTE else Family(lighting, PLACE, name)
         self.incident = np.zeros((*self.scale.shape, 3), np.float32) if self.family is None else self.family.incident
 
     def set_light(self, light: NDArray[np.float32], threads: int) -> None:
-        direct_light(self.index, self.scale, self.value, light, self.incident, threads)
+        for part, (index, value) in self.transfer:
+            direct_light(index, self.scale[part], value, light, self.incident[part], threads)

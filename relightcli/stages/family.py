@@ -7,6 +7,7 @@ cannot hold, is the business of assets (`direct_tensors`) and of clustered light
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -23,13 +24,14 @@ from relightcli.core.shade.bright import Bright, add_highlights
 from relightcli.core.shade.sampled_lobes import Lobe, Skies, like_roughness, make_lobe, make_shares, sample_lobes
 from relightcli.core.transport.direct_tensor import shade_direct
 from relightcli.core.transport.lobe_visibility import add_lobes
-from relightcli.stages.lighting import LightingStore
+from relightcli.stages.lighting import IN_MEMORY, LightingStore
 
 # Roughness from which lobes are partly, and wholly, those of the factors where narrower ones are sampled; and how much
 # later that is where f0 is 0, and reflectance high at grazing angles alone, which factors hold less well.
 BROAD = (0.4, 0.55)
 LATER, LOW_F0 = 0.35, 0.2
 BLACK = np.zeros(3, np.float32)
+STREAMED = 1 << 16  # receivers whose arrays are read at a time where memory need not hold all
 
 
 def families_of(lighting: LightingStore) -> dict[str, NDArray[np.int64]]:
@@ -46,6 +48,33 @@ def put_family(writer: formats.Writer, place: str, name: str, model: DirectModel
     for leaf, values in model.arrays().items():
         writer.put(f"{place}/{name}/brdf/{leaf}", values, dims=ARRAYS[leaf])
     writer.put(f"{place}/{name}/receiver", receivers.astype(np.int32), dims=(f"{name}_receiver",))
+
+
+class Parts:
+    """Arrays of a store, a row per receiver: in memory together, or where that is more than IN_MEMORY read for some
+    receivers at a time, over and over."""
+
+    def __init__(self, store: formats.Store, names: list[str], count: int, turned: bool = False) -> None:
+        """names of arrays for `count` receivers; turned: the last has its last two axes changed about."""
+        self.store, self.names, self.count, self.turned = store, names, count, turned
+        whole = sum(store.layouts[name].raw_bytes for name in names) <= IN_MEMORY
+        self._held = self._read(slice(0, count)) if whole else None
+
+    def _read(self, rows: slice) -> tuple[NDArray[Any], ...]:
+        arrays: Any = map(self.store.array, self.names)
+        found = [np.asarray(array[rows]) for array in arrays]
+        if self.turned:
+            found[-1] = np.ascontiguousarray(found[-1].swapaxes(-1, -2))
+        return tuple(found)
+
+    def __iter__(self) -> Iterator[tuple[slice, tuple[NDArray[Any], ...]]]:
+        """Ranges of receivers with their part of each array."""
+        if self._held is not None:
+            yield slice(0, self.count), self._held
+            return
+        for start in range(0, self.count, STREAMED):
+            rows = slice(start, min(start + STREAMED, self.count))
+            yield rows, self._read(rows)
 
 
 class NarrowLobes:
@@ -89,7 +118,9 @@ class Family:
         self.model = from_arrays(name, RESOLUTION, {leaf: read(f"{group}/brdf/{leaf}") for leaf in ARRAYS})
         self.degrees: list[float] = self.model.degrees.tolist()
         self.bits = lighting.bits_of(self.receiver)
-        self.tables = tuple(read(f"{group}/lobe_{d:g}") for d in self.degrees if d > 0.0)
+        self.tables = Parts(
+            lighting.store, [f"{group}/lobe_{d:g}" for d in self.degrees if d > 0.0], len(self.receiver)
+        )
         self.incident = np.zeros((len(self.receiver), self.model.light.shape[1] + 1, 3), np.float32)
         self.skies: tuple[NDArray[np.float32], ...] = ()
         self.narrow = None if self.degrees else NarrowLobes(name, self.bits, lighting.threads)
@@ -171,18 +202,19 @@ class Family:
             self._settings = {values: setting(self.model, *values)}
         tables = self._settings[values]
         shade_direct(self.incident, towards, self.normal, rows, tables.view_table, colour, BLACK, self.out, threads)
-        if self.degrees:
+        for part, own in self.tables if self.degrees else ():
+            first, last = np.searchsorted(rows, (part.start, part.stop))
             add_lobes(
-                self.bits,
-                self.tables,
+                self.bits[part],
+                own,
                 self.skies,
                 self.degrees,
-                towards,
-                self.normal,
-                rows,
+                towards[part],
+                self.normal[part],
+                rows[first:last] - part.start,
                 tables.energy,
                 colour,
-                self.out,
+                self.out[part],
                 threads,
             )
         np.maximum(self.out, 0.0, out=self.out)  # of truncation

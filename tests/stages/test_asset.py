@@ -15,7 +15,8 @@ from relightcli.core.measure.errors import relative_rmse
 from relightcli.core.transport.channels import coefficients
 from relightcli.errors import InputError, StoreError
 from relightcli.scene.model import Camera
-from relightcli.stages import cluster, direct_tensors, factorize, transfer_setup
+from relightcli.stages import asset as asset_stage
+from relightcli.stages import cluster, direct_tensors, factorize, family, transfer_setup
 from relightcli.stages.lighting import LightingStore
 from relightcli.stages.relight import Config, relight
 from relightcli.stages.transfer_setup import TransferSetup, coarse_cells
@@ -103,6 +104,20 @@ def layers_of(store, name, **settings):
     settings = {"env": "smooth", "workers": 2, "layers": True, **settings}
     relight(Config(store=store, output=str(output), quiet=True, **settings))
     return read_layers(output)
+
+
+@pytest.mark.parametrize("edit", [(), EDIT], ids=["as it is", "edited"])
+def test_an_asset_that_memory_need_not_hold(asset, edit, monkeypatch):
+    whole = layers_of(asset, "whole.exr", settings=edit)
+    read, original = [], family.Parts._read
+    monkeypatch.setattr(family.Parts, "_read", lambda self, rows: read.append(rows) or original(self, rows))
+    monkeypatch.setattr(family, "IN_MEMORY", 0)
+    monkeypatch.setattr(family, "STREAMED", 500)
+    monkeypatch.setattr(asset_stage, "TURNED", 300)
+    parts = layers_of(asset, "parts.exr", settings=edit)
+    assert max(rows.stop - rows.start for rows in read) == 500
+    for name, values in whole.items():
+        np.testing.assert_array_equal(parts[name], values, err_msg=name)
 
 
 @pytest.mark.parametrize("edit", [(), EDIT, MATTE], ids=["as it is", "edited", "matte"])
