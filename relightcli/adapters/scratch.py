@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 LIMIT = 1 << 30  # bytes that stay in memory
-PAGES = 1 << 29  # bytes of files that may be in memory at a time
+PAGES = 1 << 28  # bytes of files that may be in memory at a time
 _STATUS = Path("/proc/self/statm")
 
 

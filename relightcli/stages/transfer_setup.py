@@ -34,7 +34,7 @@ LAMP_COLUMNS = 3  # the local lights' light, by colour, comes after the sky's ce
 FIT = 1024  # receivers at which lights are matched by the direct light that they give
 BLOCK = 512  # receivers whose tensors are gathered at a time
 SOME = 128  # receivers whose entries are read from files at a time
-TOUCHED = 1 << 29  # bytes of files that all threads may reach for at a time
+TOUCHED = 1 << 28  # bytes of files that all threads may reach for at a time
 AROUND = 1 << 16  # bytes that the system brings with any
 SOURCES = 4096  # receivers whose light is taken at a time
 
