@@ -32,7 +32,8 @@ from relightcli.stages.promise import camera_of, out_of_reach
 from relightcli.stages.receiver_setup import PixelReceivers
 from relightcli.stages.visibility_job import VisibilityJob, block_size, create_outputs
 
-RUN, RUNS = 64, 10  # receivers of a run; runs that are traced
+RUN = 64  # receivers of a run
+FEWEST, MOST, PART = 10, 40, 0.2  # runs that are traced: part of all, within these
 PARTS = {"shadows": ("trace", "visibility/"), "lights": ("light", "lights/"), "one-bounce": ("bounce", "bounce/")}
 
 
@@ -129,7 +130,8 @@ def _pilot(
         subprocess.run([sys.executable, "-c", f"import {VisibilityJob.__module__}"], check=True)
         others = (children_seconds() - before) * processes
     worker = job.open()
-    chosen = np.unique(np.linspace(0, -(-count // RUN) - 1, RUNS).round().astype(int))
+    every = -(-count // RUN)
+    chosen = np.unique(np.linspace(0, every - 1, round(min(max(FEWEST, PART * every), MOST))).round().astype(int))
     runs = [slice(RUN * k, min(count, RUN * (k + 1))) for k in chosen.tolist()]
     worker.run(run.Block("first", runs[0].start, runs[0].stop))
     first = begun.read()

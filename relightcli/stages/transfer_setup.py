@@ -34,7 +34,7 @@ LAMP_COLUMNS = 3  # the local lights' light, by colour, comes after the sky's ce
 FIT = 1024  # receivers at which lights are matched by the direct light that they give
 BLOCK = 512  # receivers whose tensors are gathered at a time
 SOME = 128  # receivers whose entries are read from files at a time
-TOUCHED = 1 << 28  # bytes of files that all threads may reach for at a time
+TOUCHED = 1 << 29  # bytes of files that all threads may reach for at a time
 AROUND = 1 << 16  # bytes that the system brings with any
 SOURCES = 4096  # receivers whose light is taken at a time
 
@@ -184,7 +184,7 @@ class TransferSetup:
         for run in self._runs(rows, sources):
             parts.append(
                 gather_transfer(
-                    pick(self.gather, rows[run]),
+                    pick(self.gather, run),
                     0,
                     sources,
                     self.exits,
@@ -199,20 +199,23 @@ class TransferSetup:
             self.scratch.let_go()
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
-    def _runs(self, rows: NDArray[np.int64], sources: Sources) -> Iterator[slice]:
-        """Runs of some receivers that reach for no more than TOUCHED bytes of what lies in files, if anything does."""
-        if not self.scratch.used or not len(rows):
-            yield slice(0, len(rows))
-            return
+    def _runs(self, rows: NDArray[np.int64], sources: Sources) -> Iterator[NDArray[np.int64]]:
+        """Some receivers in runs that reach for no more than TOUCHED bytes of what lies in files, if anything does."""
         each = AROUND + sum(values.nbytes // max(1, len(values)) for values in (sources.even, sources.factor))
         most = TOUCHED // (each * self.threads)  # clusters are compressed side by side
-        entries = np.cumsum(self.gather.start[rows + 1] - self.gather.start[rows])
-        start = 0
-        while start < len(rows):
-            before = int(entries[start - 1]) if start else 0
-            stop = max(start + 1, int(np.searchsorted(entries, before + most, side="right")))
-            yield slice(start, stop)
-            start = stop
+        if len(rows) < 2 or not self.scratch.used or self._reach(rows) <= most:
+            yield rows
+            return
+        half = len(rows) // 2
+        yield from self._runs(rows[:half], sources)
+        yield from self._runs(rows[half:], sources)
+
+    def _reach(self, rows: NDArray[np.int64]) -> int:
+        """How many receivers some others see."""
+        seen = np.zeros(len(self.row), bool)
+        for a, b in zip(self.gather.start[rows], self.gather.start[rows + 1], strict=True):
+            seen[self.gather.source[a:b]] = True
+        return int(np.count_nonzero(seen))
 
     def second_sources(self, lights: Sources, order: int, only: NDArray[np.int64] | None = None) -> Sources:
         """What receivers gather of light that was reflected once: for each light of `lights` and channel, (l, q).
