@@ -83,14 +83,12 @@ class _Begun(LightingStore):
                 yield from super().blocks(start, stop, needed)
 
     def _gathers(self, first: int, last: int, step: int) -> Iterator[tuple[int, Gather]]:
-        cells, nothing = self.store.layouts["bounce/hit"].shape[2], np.zeros((2, 0), np.int32)
+        cells, ints, floats = self.store.layouts["bounce/hit"].shape[2], np.zeros(0, np.int32), np.zeros(0, np.float32)
         at = first
 
         def unseen(stop: int) -> tuple[int, Gather]:
-            empty = nothing[0].astype(np.float32)
-            return at, Gather(
-                cells, np.zeros(stop - at + 1, np.int64), nothing[0], nothing[1].astype(np.int16), empty, empty
-            )
+            start = np.zeros(stop - at + 1, np.int64)
+            return at, Gather(cells, start, ints, ints.astype(np.int16), floats, floats)
 
         for start, part in super()._gathers(first, last, step):
             if start > at:

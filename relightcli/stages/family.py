@@ -58,11 +58,13 @@ class Parts:
         """names of arrays for `count` receivers; turned: the last has its last two axes changed about."""
         self.store, self.names, self.count, self.turned = store, names, count, turned
         whole = sum(store.layouts[name].raw_bytes for name in names) <= IN_MEMORY
-        self._held = self._read(slice(0, count)) if whole else None
+        self._held = self._turn([store.read(name) for name in names]) if whole else None
 
     def _read(self, rows: slice) -> tuple[NDArray[Any], ...]:
         arrays: Any = map(self.store.array, self.names)
-        found = [np.asarray(array[rows]) for array in arrays]
+        return self._turn([np.asarray(array[rows]) for array in arrays])
+
+    def _turn(self, found: list[NDArray[Any]]) -> tuple[NDArray[Any], ...]:
         if self.turned:
             found[-1] = np.ascontiguousarray(found[-1].swapaxes(-1, -2))
         return tuple(found)
