@@ -99,10 +99,16 @@ class TransferSetup:
         """The receivers whose light some others reflect, rising."""
         seen = np.zeros(len(self.row), bool)
         for start in range(0, len(rows), SOME):
-            sources = pick(self.gather, rows[start : start + SOME]).source
-            seen[sources] = seen[self.partner[sources]] = True
+            self._mark_seen(rows[start : start + SOME], seen)
             self.scratch.let_go()
+        seen[self.partner[seen]] = True
         return np.flatnonzero(seen)
+
+    def _mark_seen(self, rows: NDArray[np.int64], seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """`seen` (N,), with the receivers that some others see."""
+        for a, b in zip(self.gather.start[rows], self.gather.start[rows + 1], strict=True):
+            seen[self.gather.source[a:b]] = True
+        return seen
 
     def sources(self, basis: NDArray[np.float32], only: NDArray[np.int64] | None = None) -> Sources:
         """Responses to the lights of `basis` (6 CELLS^2, L), the lamps' columns after them.
@@ -203,19 +209,15 @@ class TransferSetup:
         """Some receivers in runs that reach for no more than TOUCHED bytes of what lies in files, if anything does."""
         each = AROUND + sum(values.nbytes // max(1, len(values)) for values in (sources.even, sources.factor))
         most = TOUCHED // (each * self.threads)  # clusters are compressed side by side
-        if len(rows) < 2 or not self.scratch.used or self._reach(rows) <= most:
+        if len(rows) < 2 or not self.scratch.used:
+            yield rows
+            return
+        if np.count_nonzero(self._mark_seen(rows, np.zeros(len(self.row), bool))) <= most:
             yield rows
             return
         half = len(rows) // 2
         yield from self._runs(rows[:half], sources)
         yield from self._runs(rows[half:], sources)
-
-    def _reach(self, rows: NDArray[np.int64]) -> int:
-        """How many receivers some others see."""
-        seen = np.zeros(len(self.row), bool)
-        for a, b in zip(self.gather.start[rows], self.gather.start[rows + 1], strict=True):
-            seen[self.gather.source[a:b]] = True
-        return int(np.count_nonzero(seen))
 
     def second_sources(self, lights: Sources, order: int, only: NDArray[np.int64] | None = None) -> Sources:
         """What receivers gather of light that was reflected once: for each light of `lights` and channel, (l, q).
